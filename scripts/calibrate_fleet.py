@@ -1,0 +1,35 @@
+#!/usr/bin/env python3
+"""Calibrate every camera of a fleet: one table of lenses, over zoom, for each."""
+
+import argparse
+import sys
+
+from torchptz.fleet.calibrate import calibrate
+from torchptz.fleet.config import ConfigError
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("config", help="the fleet, such as configs/fleet.yaml")
+    parser.add_argument("out", help="folder of the run, such as runs/demo")
+    parser.add_argument("--powers", type=float, nargs="+", default=[1, 2, 3], help="of r in L")
+    options = parser.parse_args()
+
+    def progress(camera: str, what: str, done: int, total: int) -> None:
+        print(f"{camera}: {what} ({done}/{total})", file=sys.stderr)
+
+    try:
+        summary = calibrate(options.config, options.out, options.powers, progress)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    for name, camera in summary.cameras.items():
+        for zoom in camera.zooms:
+            rms = "" if zoom.rms_px is None else f"{zoom.rms_px:.3f} px"
+            print(f"{name} at {zoom.magnification:.2f}x: {rms} {zoom.error or 'ok'}")
+        print(f"{name}: {camera.error or camera.table or 'no lens'}")
+    return 0 if summary.all_ok else 2 if summary.none_ok else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

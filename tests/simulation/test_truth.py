@@ -1,0 +1,94 @@
+import json
+
+import numpy as np
+import pytest
+
+from torchptz.simulation import SimulatedFleet, SimulationError, load_truth
+
+CONFIG = {
+    "cameras": [
+        {
+            "name": "a",
+            "seed": 21,
+            "head": {"pixel_aspect": 0.985, "roll_deg": 1.5, "principal_point_drift_px": (2, 1)},
+        },
+        {"name": "b", "seed": 22},
+    ]
+}
+POINTS = np.array([[0.0, 0.0], [735, 543], [100, 400], [368, 272]])
+
+
+@pytest.fixture
+def fleet():
+    return SimulatedFleet(CONFIG)
+
+
+@pytest.fixture
+def path(fleet, tmp_path):
+    fleet.write_truth(tmp_path / "truth.json", zoom_units=[0, 5000.5, 16384])
+    return tmp_path / "truth.json"
+
+
+class TestFile:
+    def test_says_what_it_is(self, path):
+        data = json.loads(path.read_text())
+        assert (data["schema"], data["version"]) == ("torchptz.truth", 1)
+
+    def test_reads_back_exactly(self, fleet, path):
+        truths = load_truth(path)
+        for name, camera in fleet.cameras.items():
+            assert truths[name].optics == camera.optics
+            assert truths[name].seed == camera.config.seed
+        assert truths["a"].head["roll_deg"] == 1.5
+        assert truths["b"].ball["distance_m"] == 12
+
+    def test_table_is_enough_without_the_package(self, path):
+        """Its rows hold a formula anyone can evaluate: distorting the true answer gives back."""
+        truth = load_truth(path)["a"]
+        for row in json.loads(path.read_text())["cameras"][0]["table"]:
+            undistorted = truth.undistort(row["zoom_units"], POINTS)
+            q = (undistorted - row["centre_px"]) / (1, 0.985)
+            rho = np.linalg.norm(q, axis=1, keepdims=True) / row["scale_px"]
+            a, b, c = row["undistorted_to_distorted_abc"]
+            back = row["centre_px"] + q * (1 + a * rho + b * rho**2 + c * rho**3) * (1, 0.985)
+            np.testing.assert_allclose(back, POINTS, atol=1e-8)
+
+    def test_default_table_spans_the_zoom(self, fleet, tmp_path):
+        fleet.write_truth(tmp_path / "t.json")
+        table = json.loads((tmp_path / "t.json").read_text())["cameras"][1]["table"]
+        assert table[0]["magnification"] == 1
+        assert table[-1]["magnification"] == pytest.approx(25)
+
+    @pytest.mark.parametrize("text", ["{", "[]", '{"schema": "other", "version": 1}'])
+    def test_other_files_are_refused(self, tmp_path, text):
+        (tmp_path / "x.json").write_text(text)
+        with pytest.raises(SimulationError, match=r"x\.json"):
+            load_truth(tmp_path / "x.json")
+
+    def test_lost_parameter_is_refused(self, path):
+        data = json.loads(path.read_text())
+        del data["cameras"][0]["optics"]["blend_rate"]
+        path.write_text(json.dumps(data))
+        with pytest.raises(SimulationError, match="blend_rate"):
+            load_truth(path)
+
+
+class TestValues:
+    def test_are_the_cameras(self, fleet, path):
+        truth, camera = load_truth(path)["a"], fleet.cameras["a"]
+        state = camera.optics.at(9000)
+        assert truth.focal_length(9000) == state.focal_length
+        assert truth.focal_length(9000) == pytest.approx(
+            truth.magnification(9000) * truth.focal_length(0)
+        )
+        np.testing.assert_array_equal(truth.principal_point(9000), state.principal_point)
+        np.testing.assert_array_equal(truth.centre(9000), state.centre)
+        np.testing.assert_allclose(
+            truth.undistort(9000, camera.ball_pixel((0.1, 0.2, 9000))),
+            state.project(camera.view((0.1, 0.2, 9000)).to_camera(camera.world.ball.position)),
+            atol=1e-8,
+        )
+
+    def test_distort_inverts(self, path):
+        truth = load_truth(path)["b"]
+        np.testing.assert_allclose(truth.distort(0, truth.undistort(0, POINTS)), POINTS, atol=1e-9)

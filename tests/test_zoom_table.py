@@ -1,0 +1,372 @@
+"""Zoom tables: interpolation, range, units, failed knots, the file by hand, refusals."""
+
+import json
+import math
+from enum import Enum
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchptz.lens import RadialLens
+from torchptz.zoom_table import Knot, ZoomTable
+
+SIZE = [640, 480]
+ZOOMS = [1.0, 2.0, 8.0]
+UNITS = [0.0, 3000.0, 9000.0]
+CENTERS = [[310.0, 250.0], [320.0, 245.0], [322.0, 240.0]]
+COEFFICIENTS = [[-0.1, 0.02], [-0.04, 0.01], [0.0, 0.002]]
+
+
+class Status(Enum):
+    OK = "ok"
+    NOT_CONVERGED = "look at the points"
+
+
+def lenses():
+    return RadialLens(CENTERS, COEFFICIENTS, (1, 2), 330.0, SIZE, 1.05)
+
+
+def full_table(**options):
+    return ZoomTable.from_lens(
+        lenses(),
+        ZOOMS,
+        camera="north",
+        zoom_units=UNITS,
+        rms_px=torch.tensor([0.1, 0.2, 0.3]),
+        gain=[1.01, 1.02, math.nan],
+        gain_sigma=[0.01, 0.02, math.nan],
+        covariance=torch.eye(4).double().repeat(3, 1, 1) * 0.25,
+        focal_length_px=np.array([500.0, 1000.0, 4000.0]),
+        focal_length_sigma_px=[1.0, 2.0, 8.0],
+        points=[100, 200, 300],
+        lines=[10, 20, 30],
+        principal_point=[321.0, 239.0],
+        principal_point_covariance=[[1.0, 0.1], [0.1, 2.0]],
+        **options,
+    )
+
+
+def assert_same_lens(one, other, **tolerance):
+    for name in ("center", "coefficients", "powers", "scale", "image_size", "pixel_aspect"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), **tolerance)
+
+
+class TestInterpolation:
+    def test_a_knot_is_its_own_lens(self):
+        table = full_table()
+        assert table.zooms == ZOOMS
+        assert_same_lens(table.at(table.zooms), lenses(), rtol=0, atol=0)
+        for i, zoom in enumerate(ZOOMS):
+            assert_same_lens(table.at(zoom), lenses()[i], rtol=0, atol=0)
+
+    def test_linear_in_the_logarithm_of_the_magnification(self):
+        zooms = np.geomspace(1, 8, 13)
+        found = full_table().at(zooms)
+        for values, knots in ((found.center, CENTERS), (found.coefficients, COEFFICIENTS)):
+            for column in (0, 1):
+                expected = np.interp(np.log(zooms), np.log(ZOOMS), np.array(knots)[:, column])
+                np.testing.assert_allclose(values[:, column], expected, rtol=1e-12, atol=1e-15)
+
+    def test_one_number_is_a_batch_of_one_and_a_list_a_batch(self):
+        table = full_table()
+        assert len(table.at(3)) == 1
+        assert len(table.at(np.float32(3))) == 1
+        assert len(table.at(torch.tensor(3.0))) == 1
+        assert len(table.at([3])) == 1
+        assert len(table.at(torch.tensor([3.0, 1.0]))) == 2
+
+    @given(zooms=st.lists(st.floats(1, 8), min_size=1, max_size=6))
+    @settings(max_examples=40, deadline=None)
+    def test_items_do_not_know_of_each_other(self, zooms):
+        together = full_table().at(zooms)
+        for i, zoom in enumerate(zooms):
+            assert_same_lens(together[i], full_table().at(zoom), rtol=0, atol=0)
+
+    def test_between_two_knots_the_lens_folds_no_earlier_than_at_both(self):
+        table = ZoomTable.from_lens(
+            RadialLens([[320.0, 240.0]] * 2, [[-0.3, 0.0], [0.2, -0.25]], (1, 2), None, SIZE),
+            [1, 4],
+        )
+        knots = table.lens.valid_radius.amin()
+        assert bool((table.at(np.geomspace(1, 4, 9)).valid_radius >= knots - 1e-9).all())
+
+    def test_gradient_in_zoom(self):
+        zoom = torch.tensor([1.3, 5.0], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda z: full_table().at(z).coefficients, zoom)
+
+
+class TestRange:
+    @pytest.mark.parametrize("zoom", [0.9, 8.1, [2.0, 8.1], torch.tensor(8.1)])
+    def test_beyond_the_knots_is_refused_with_a_way_out(self, zoom):
+        with pytest.raises(ValueError, match=r"north: zoom .* 1 to 8; .*extrapolate=True"):
+            full_table().at(zoom)
+
+    def test_or_the_outermost_lens_is_held(self):
+        held = full_table().at([0.5, 2.0, 20.0], extrapolate=True)
+        assert_same_lens(held, lenses(), rtol=0, atol=0)
+
+    def test_rounding_is_not_beyond(self):
+        assert_same_lens(
+            full_table().at([1 - 1e-7, 2.0, 8 * (1 + 1e-7)]), lenses(), rtol=1e-6, atol=0
+        )
+
+    def test_a_single_knot_answers_for_its_zoom_only(self):
+        table = ZoomTable.from_lens(lenses()[1], [2.0])
+        assert_same_lens(table.at(2.0), lenses()[1], rtol=0, atol=0)
+        assert_same_lens(table.at(2.0 * (1 + 5e-7)), lenses()[1], rtol=0, atol=0)
+        with pytest.raises(ValueError, match=r"zoom 2\.1 is outside the calibrated range 2 to 2"):
+            table.at(2.1)
+        assert_same_lens(table.at(7.0, extrapolate=True), lenses()[1], rtol=0, atol=0)
+
+    @pytest.mark.parametrize("zoom", [0.0, -1.0, math.nan, math.inf, [[1.0]]])
+    def test_no_magnification(self, zoom):
+        with pytest.raises(ValueError, match="north: zoom must be one positive magnification"):
+            full_table().at(zoom, extrapolate=True)
+
+
+class TestUnits:
+    def test_logarithm_of_magnification_is_linear_in_the_units(self):
+        asked = np.linspace(0, 9000, 7)
+        expected = np.exp(np.interp(asked, UNITS, np.log(ZOOMS)))
+        np.testing.assert_allclose(full_table().magnification(asked), expected)
+        assert_same_lens(
+            full_table().at_units(asked), full_table().at(expected), rtol=1e-9, atol=1e-12
+        )
+
+    def test_units_may_fall_with_the_magnification(self):
+        table = ZoomTable.from_lens(lenses(), ZOOMS, zoom_units=[90.0, 60.0, 10.0])
+        assert_same_lens(table.at_units([90, 60, 10]), lenses(), rtol=1e-12, atol=1e-15)
+
+    def test_range(self):
+        with pytest.raises(ValueError, match=r"9500 device units is outside .* 0 to 9000"):
+            full_table().at_units(9500)
+        with pytest.raises(ValueError, match="nan device units"):
+            full_table().at_units(math.nan, extrapolate=True)
+        assert_same_lens(full_table().at_units([-1, 3000, 9500], extrapolate=True), lenses())
+
+    def test_without_units(self):
+        with pytest.raises(ValueError, match=r"cam: .*does not know the device's zoom units; .*at"):
+            ZoomTable.from_lens(lenses(), ZOOMS, camera="cam").at_units(3)
+
+
+class TestFailedKnots:
+    def table(self):
+        broken = RadialLens(
+            CENTERS, [COEFFICIENTS[0], [math.nan] * 2, COEFFICIENTS[2]], (1, 2), None, SIZE
+        )
+        return ZoomTable.from_lens(
+            broken,
+            ZOOMS,
+            status=[Status.OK, Status.NOT_CONVERGED, "Status.OK"],
+            rms_px=[0.1, math.nan, 0.2],
+            covariance=torch.full((3, 4, 4), math.nan),
+        )
+
+    def test_they_are_kept_and_not_used(self):
+        table = self.table()
+        assert table.zooms == [1.0, 8.0]
+        assert [knot.status for knot in table.knots] == ["OK", "NOT_CONVERGED", "OK"]
+        assert [knot.usable for knot in table.knots] == [True, False, True]
+        assert table.knots[1].lens is None
+        assert table.knots[1].rms_px is None
+        assert table.knots[0].covariance is None
+        middle = (np.array(COEFFICIENTS[0]) * 2 + np.array(COEFFICIENTS[2])) / 3
+        np.testing.assert_allclose(table.at(2.0).coefficients[0], middle)
+
+    def test_their_lens_is_kept_where_there_is_one(self, tmp_path):
+        table = full_table(status=["OK", "NOT_MONOTONIC", "OK"])
+        table.save(tmp_path / "table.json")
+        for kept in (table, ZoomTable.load(tmp_path / "table.json")):
+            assert kept.zooms == [1.0, 8.0]
+            assert_same_lens(kept.knots[1].lens, lenses()[1], rtol=0, atol=0)
+
+    def test_the_maker_of_the_table_may_judge_otherwise(self):
+        table = full_table(status=["OK", "CENTER_UNOBSERVABLE", "OK"], usable=[True, True, False])
+        assert table.zooms == [1.0, 2.0]
+
+    def test_a_table_without_any_lens_says_why(self, tmp_path):
+        table = ZoomTable(
+            camera="east", knots=[Knot(1.0, None, "TOO_FEW_LINES"), Knot(2.0, None, "X")]
+        )
+        table.save(tmp_path / "table.json")
+        for kept in (table, ZoomTable.load(tmp_path / "table.json")):
+            assert kept.zooms == []
+            with pytest.raises(ValueError, match=r"east: no zoom .*\(1: TOO_FEW_LINES, 2: X\)"):
+                kept.at(1.0)
+
+    def test_a_good_status_without_a_lens_is_refused(self):
+        with pytest.raises(ValueError, match="zoom 3: status OK, but its lens is missing"):
+            Knot(3.0, None)
+
+
+class TestFile:
+    def test_round_trip(self, tmp_path):
+        path, table = tmp_path / "table.json", full_table()
+        table.save(path)
+        loaded = ZoomTable.load(path)
+        assert (loaded.camera, loaded.created_by) == ("north", table.created_by)
+        assert loaded.created_by.startswith("torchptz")
+        assert loaded.principal_point.tolist() == [321.0, 239.0]
+        assert loaded.principal_point_covariance.tolist() == [[1.0, 0.1], [0.1, 2.0]]
+        for one, other in zip(loaded.knots, table.knots, strict=True):
+            assert_same_lens(one.lens, other.lens, rtol=0, atol=0)
+            torch.testing.assert_close(one.covariance, other.covariance, rtol=0, atol=0)
+            for name in (
+                *("zoom", "status", "usable", "zoom_units", "rms_px", "gain", "gain_sigma"),
+                *("focal_length_px", "focal_length_sigma_px", "points", "lines"),
+            ):
+                assert getattr(one, name) == getattr(other, name), name
+        assert loaded.knots[2].gain is None  # NaN is no JSON
+        assert loaded.knots[0].gain == 1.01
+        loaded.save(tmp_path / "again.json")
+        assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+    def test_a_few_lines_of_json_and_numpy_undistort_a_point(self, tmp_path):
+        full_table().save(tmp_path / "table.json")
+        point = np.array([37.0, 411.0])
+
+        table = json.loads((tmp_path / "table.json").read_text())
+        knot = next(knot for knot in table["knots"] if knot["zoom"] == 2 and knot["usable"])
+        offset = point - knot["center"]
+        r = np.hypot(table["pixel_aspect"] * offset[0], offset[1]) / table["scale"]
+        powers = np.array(table["powers"])
+        correction = 1 + np.sum(knot["coefficients"] * r**powers)
+        undistorted = knot["center"] + correction * offset
+
+        expected = full_table().at(2.0).undistort(torch.from_numpy(point)[None, None])
+        np.testing.assert_allclose(undistorted, expected[0, 0], rtol=1e-14)
+
+    def test_it_is_strict_json_with_a_schema(self, tmp_path):
+        full_table(status=["OK", "X", "Y"]).save(tmp_path / "table.json")
+
+        def refuse(constant):
+            raise AssertionError(constant)
+
+        stored = json.loads((tmp_path / "table.json").read_text(), parse_constant=refuse)
+        assert stored["schema"] == "torchptz.zoom_table"
+        assert stored["version"] == 1
+
+
+class TestRefusedFiles:
+    def refusal(self, tmp_path, change):
+        path = tmp_path / "bad.json"
+        full_table().save(path)
+        stored = json.loads(path.read_text())
+        stored = change(stored) or stored
+        path.write_text(json.dumps(stored))
+        with pytest.raises(ValueError, match=r"bad\.json: ") as error:
+            ZoomTable.load(path)
+        return str(error.value)
+
+    @pytest.mark.parametrize(
+        ("field", "value", "words"),
+        [
+            ("schema", "torchptz.lens", "schema is 'torchptz.lens'"),
+            ("version", 2, "version is 2; this torchptz reads version 1"),
+            ("version", None, "version is None"),
+            ("camera", 3, "camera must be a text, not 3"),
+            ("scale", math.nan, "scale must be a finite number, not nan"),
+            ("scale", -1.0, "knots[0]: scale and pixel_aspect must be positive"),
+            ("scale", True, "scale must be a finite number"),
+            ("powers", [1, "two"], "powers must be a list of n finite numbers"),
+            ("powers", [2, 1], "knots[0]: powers must be positive and increasing"),
+            ("image_size", [640], "image_size must be a list of 2 finite numbers"),
+            ("image_size", None, "image_size must be a list of 2 finite numbers, not None"),
+            ("principal_point", [1, math.inf], "principal_point must be a list of 2 finite"),
+            ("principal_point_covariance", [[1, 2]], "principal_point_covariance must be a list"),
+            ("knots", {}, "knots must be a list"),
+            ("knots", [3], "knots[0] must be an object"),
+        ],
+    )
+    def test_table_fields_are_named(self, tmp_path, field, value, words):
+        assert words in self.refusal(tmp_path, lambda stored: stored.update({field: value}))
+
+    @pytest.mark.parametrize(
+        ("field", "value", "words"),
+        [
+            ("zoom", None, "knots[1].zoom must be a finite number, not None"),
+            ("zoom", -2, "knots[1]: zoom must be a positive magnification"),
+            ("zoom", 1.0, "north: zooms must be ascending and different, but 1 is followed by 1"),
+            ("zoom", 9.0, "north: zooms must be ascending and different, but 9 is followed by 8"),
+            ("center", None, "knots[1].center must be a list of 2 finite numbers, not None"),
+            ("coefficients", [math.nan, 0], "knots[1].coefficients must be a list of 2 finite"),
+            ("coefficients", [1], "knots[1].coefficients must be a list of 2 finite numbers"),
+            ("covariance", [[1]], "knots[1].covariance must be a list of 4x4 finite numbers"),
+            ("rms_px", "small", "knots[1].rms_px must be a finite number, not 'small'"),
+            ("usable", "yes", "knots[1].usable must be true or false, not 'yes'"),
+            ("status", None, "knots[1].status must be a text, not None"),
+            ("zoom_units", None, "north: zoom units of some zooms are missing"),
+            ("zoom_units", 9999.0, "north: zoom units must run one way with the magnification"),
+        ],
+    )
+    def test_knot_fields_are_named(self, tmp_path, field, value, words):
+        assert words in self.refusal(
+            tmp_path, lambda stored: stored["knots"][1].update({field: value})
+        )
+
+    @pytest.mark.parametrize("field", ["camera", "scale", "knots", "created_by", "principal_point"])
+    def test_missing_table_fields(self, tmp_path, field):
+        words = self.refusal(tmp_path, lambda stored: stored.pop(field) and None)
+        assert f"{field} is missing" in words
+
+    @pytest.mark.parametrize("field", ["zoom", "center", "coefficients", "usable", "gain", "lines"])
+    def test_missing_knot_fields(self, tmp_path, field):
+        words = self.refusal(tmp_path, lambda stored: stored["knots"][2].pop(field, 0) and None)
+        assert f"knots[2].{field} is missing" in words
+
+    @pytest.mark.parametrize("content", [b"", b"zoom,center", b"\xff\xfe\x00", b"[1, 2]", b"3"])
+    def test_other_files(self, tmp_path, content):
+        (tmp_path / "bad.json").write_bytes(content)
+        with pytest.raises(ValueError, match=r"bad\.json: "):
+            ZoomTable.load(tmp_path / "bad.json")
+
+    def test_a_missing_file_is_missing(self, tmp_path):
+        with pytest.raises(FileNotFoundError):
+            ZoomTable.load(tmp_path / "none.json")
+
+
+class TestMaking:
+    def test_from_lens_sorts(self):
+        order = [2, 0, 1]
+        shuffled = RadialLens(
+            [CENTERS[i] for i in order], [COEFFICIENTS[i] for i in order], (1, 2), 330.0, SIZE, 1.05
+        )
+        table = ZoomTable.from_lens(shuffled, [ZOOMS[i] for i in order], rms_px=[3.0, 1.0, 2.0])
+        assert_same_lens(table.at(ZOOMS), lenses(), rtol=0, atol=0)
+        assert [knot.rms_px for knot in table.knots] == [1.0, 2.0, 3.0]
+
+    def test_lengths_must_agree(self):
+        with pytest.raises(ValueError, match="cam: 2 zooms for 3 lenses"):
+            ZoomTable.from_lens(lenses(), [1, 2], camera="cam")
+        with pytest.raises(ValueError, match="cam: 1 gain for 3 lenses"):
+            ZoomTable.from_lens(lenses(), ZOOMS, camera="cam", gain=[1.0])
+        with pytest.raises(ValueError, match="cam: a knot has no shoe_size"):
+            ZoomTable.from_lens(lenses(), ZOOMS, camera="cam", shoe_size=[1, 2, 3])
+
+    def test_the_same_zoom_twice(self):
+        with pytest.raises(ValueError, match="but 2 is followed by 2"):
+            ZoomTable.from_lens(lenses(), [1, 2, 2 + 1e-9])
+
+    @pytest.mark.parametrize("change", ["powers", "scale", "image_size", "pixel_aspect"])
+    def test_lenses_of_two_kinds(self, change):
+        options = {"powers": (1, 2), "scale": 330.0, "image_size": SIZE, "pixel_aspect": 1.05}
+        other = {"powers": (1, 3), "scale": 320.0, "image_size": [1280, 720], "pixel_aspect": 1.0}
+        first = RadialLens([CENTERS[0]], [COEFFICIENTS[0]], **options)
+        second = RadialLens([CENTERS[1]], [COEFFICIENTS[1]], **{**options, change: other[change]})
+        with pytest.raises(ValueError, match=f"cam: {change} is .* at zoom 1 and .* at zoom 2"):
+            ZoomTable("cam", (Knot(1.0, first), Knot(2.0, second)))
+
+    def test_covariance_of_another_lens(self):
+        with pytest.raises(ValueError, match=r"zoom 1: covariance must have shape \(4, 4\)"):
+            ZoomTable.from_lens(lenses()[0], [1.0], covariance=torch.eye(5)[None])
+
+    def test_a_knot_has_one_lens(self):
+        with pytest.raises(ValueError, match="zoom 1: a knot has one lens, not 3"):
+            Knot(1.0, lenses())
+
+    def test_principal_point(self):
+        with pytest.raises(ValueError, match="cam: principal_point must be finite"):
+            ZoomTable.from_lens(lenses(), ZOOMS, camera="cam", principal_point=[1.0, math.nan])

@@ -1,0 +1,49 @@
+"""What every batch of the core can do: length, slicing by items, moving between devices."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import ClassVar, Self
+
+import torch
+from torch import Tensor
+
+
+class Batched:
+    """Mixin for frozen dataclasses whose tensors carry the batch on their first axis.
+
+    Fields named in ``_shared`` belong to all items alike (such as the powers of a lens). Lists are
+    per item; nested batches are sliced with their owner; None stays None.
+    """
+
+    _shared: ClassVar[frozenset[str]] = frozenset()
+
+    def __len__(self) -> int:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in self._shared and value is not None:
+                return len(value)
+        raise TypeError(f"{type(self).__name__} has no batched field")
+
+    def __getitem__(self, index: int | slice) -> Self:
+        """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``."""
+        if isinstance(index, int):
+            if not -len(self) <= index < len(self):
+                raise IndexError(f"item {index} of a batch of {len(self)}")
+            index %= len(self)
+            index = slice(index, index + 1)
+        changed = {
+            field.name: getattr(self, field.name)[index]
+            for field in fields(self)
+            if field.name not in self._shared and getattr(self, field.name) is not None
+        }
+        return replace(self, **changed)
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same batch with all tensors on ``device``."""
+        changed = {
+            field.name: getattr(self, field.name).to(device)
+            for field in fields(self)
+            if isinstance(getattr(self, field.name), Tensor | Batched)
+        }
+        return replace(self, **changed)

@@ -1,0 +1,91 @@
+"""VISCA commands and inquiries as the CGI requests of Sony's SNC-RZ30."""
+
+import logging
+import time
+from collections.abc import Callable
+
+from . import visca
+from .base import ProtocolError
+from .transport import CameraTransport, Reply
+
+logger = logging.getLogger(__name__)
+
+_COMMAND_PATHS = ("/command/ptzf.cgi", "/command/visca-ptzf.cgi")  # firmware >= 1.10, <= 1.09
+_INQUIRY_PATHS = ("/command/visca-inquiry.cgi",)
+_BUFFER_FULL_ATTEMPTS, _BUFFER_FULL_PAUSE_S = 3, 0.1
+
+
+class ViscaChannel:
+    """Speaks VISCA through a camera's transport. Its methods raise CameraError subclasses."""
+
+    def __init__(self, transport: CameraTransport) -> None:
+        self._transport = transport
+        self._found: dict[tuple[str, ...], str] = {}  # which of several paths this firmware has
+
+    def command(self, command: str, *, repeatable: bool = True) -> None:
+        """Send a VISCA command. All but the focus trigger name a target, not a change: to hear
+        one twice does no more than to hear it once, so a lost one may be sent again.
+        """
+        for _ in range(_BUFFER_FULL_ATTEMPTS):
+            reply = self.first_found(
+                _COMMAND_PATHS,
+                lambda path: self._transport.get(f"{path}?visca={command}", repeatable=repeatable),
+            )
+            if reply.status not in (200, 204):
+                raise self._transport.status_error(reply, f"the command {command}")
+            fault = self._fault_in(reply)
+            if fault is None:
+                return
+            # A refused command was not begun, so any may be sent again.
+            if fault.code != visca.BUFFER_FULL:
+                break
+            time.sleep(_BUFFER_FULL_PAUSE_S)
+        raise self._visca_error(fault, command)
+
+    def _fault_in(self, reply: Reply) -> visca.ViscaError | None:
+        """The VISCA error in the reply to a command, if any; other bodies vary and say nothing."""
+        try:
+            visca.messages(reply.body)
+        except visca.ViscaError as error:
+            if error.code is not None:
+                return error
+            logger.debug("%s: %s, taken for consent", self._transport.label, error)
+        return None
+
+    def ask(self, inquiry: str, nibbles: int) -> bytes:
+        """The data of the answer to a VISCA inquiry."""
+        reply = self.first_found(
+            _INQUIRY_PATHS, lambda path: self._transport.get(f"{path}?visca={inquiry}")
+        )
+        if reply.status != 200:
+            raise self._transport.status_error(reply, f"the inquiry {inquiry}")
+        try:
+            return visca.answer(reply.body, nibbles)
+        except visca.ViscaError as error:
+            raise self._visca_error(error, inquiry) from error
+
+    def ask_if_known(self, inquiry: str, nibbles: int) -> int | None:
+        """The number in the answer to an inquiry that not every firmware knows."""
+        try:
+            return visca.decode_unsigned(self.ask(inquiry, nibbles))
+        except ProtocolError as error:
+            logger.debug("%s (taken for not known)", error)
+            return None
+
+    def _visca_error(self, fault: visca.ViscaError, request: str) -> ProtocolError:
+        way_out = (
+            "wait until its motion ends, and see whether someone else steers it"
+            if fault.code in (visca.BUFFER_FULL, visca.NOT_EXECUTABLE)
+            else "check that it is an SNC-RZ30, with dialect sony_rz30"
+        )
+        return self._transport.error(ProtocolError, f"answered {request} with {fault}", way_out)
+
+    def first_found(self, paths: tuple[str, ...], request: Callable[[str], object]):
+        """The answer at the first path that this firmware has, remembered for the next time."""
+        known = self._found.get(paths)
+        for path in paths if known is None else (known,):
+            answer = request(path)
+            if not (isinstance(answer, Reply) and answer.status == 404):
+                self._found[paths] = path
+                break
+        return answer

@@ -1,0 +1,317 @@
+"""The command ``torchptz``. Every command is a library function; this file only talks.
+
+Exit codes: 0 everything succeeded; 1 a part failed, the rest is there; 2 nothing succeeded, or the
+command was called wrongly.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+# What needs torch or OpenCV is imported where it is used: --help should not take seconds.
+
+_CONFIG_SUFFIXES = (".yaml", ".yml")
+_EXISTING = click.Path(exists=True, path_type=Path)
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_OUT = click.Path(file_okay=False, path_type=Path)
+
+logger = logging.getLogger(__name__)
+
+
+class _Powers(click.ParamType):
+    """A list such as 1,2,3."""
+
+    name = "numbers"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(float(part) for part in value.split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a list of numbers such as 1,2,3", param, ctx)
+
+
+_powers = click.option(
+    "--powers", type=_Powers(), default="1,2,3", show_default=True, help="Powers of r in the lens."
+)
+
+
+class _Commands(click.Group):
+    """Turns the errors that a user can do something about into one line and exit code 2."""
+
+    def invoke(self, ctx: click.Context):
+        try:
+            return super().invoke(ctx)
+        except (ValueError, OSError, RuntimeError) as error:
+            if not _is_expected(error):
+                raise
+            logger.debug("traceback", exc_info=True)
+            click.echo(f"torchptz: {_one_line(error)}", err=True)
+            ctx.exit(2)
+
+
+def _is_expected(error: Exception) -> bool:
+    """Errors of the outside world and of what was given; torch's own are defects of ours."""
+    if isinstance(error, ValueError | OSError):
+        return True
+    names = {kind.__name__ for kind in type(error).__mro__}
+    return bool(names & {"CameraError", "SimulationError"})
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="torchptz")
+@click.option("-v", "--verbose", count=True, help="Log what happens; twice: log everything.")
+def main(verbose: int) -> None:
+    """Pan-tilt-zoom cameras that calibrate their own lenses.
+
+    Exit codes: 0 everything succeeded; 1 a part failed, the rest is there; 2 nothing succeeded, or
+    the command was called wrongly.
+    """
+    level = {0: logging.WARNING, 1: logging.INFO}.get(verbose, logging.DEBUG)
+    # The root logger stays at warnings: libraries have much to say about themselves.
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    logging.getLogger("torchptz").setLevel(level)
+
+
+@main.command()
+@click.argument("source", type=_EXISTING)
+@click.option("--out", "-o", type=_OUT, required=True, help="Folder of the run.")
+@click.option("--board", help="Inner corners of the photographed chessboard, such as 9x6.")
+@click.option("--name", help="Name of the camera; default the folder's or the file's.")
+def collect(source: Path, out: Path, board: str | None, name: str | None) -> None:
+    """Collect line patterns from SOURCE.
+
+    SOURCE is a fleet's configuration (.yaml), a folder of chessboard photographs of one camera, or
+    a set of measured lines (.npz).
+    """
+    if source.suffix.lower() in _CONFIG_SUFFIXES and source.is_file():
+        _refuse("--board and --name go with photographs", board, name)
+        _collect_fleet(source, out)
+        return
+    _quiet_decoders()
+    from torchptz.fleet.photographs import collect_line_set, collect_photographs, parse_board
+
+    if source.is_dir():
+        if board is None:
+            raise click.UsageError("photographs need --board, the inner corners, such as 9x6")
+        with _counting("photographs") as progress:
+            found = collect_photographs(source, out, parse_board(board), name, progress)
+        for photograph, reason in found.skipped.items():
+            click.echo(f"skipped: {photograph} {reason}", err=True)
+        click.echo(f"{len(found.used)} of {len(found.used) + len(found.skipped)} photographs used")
+    elif source.suffix.lower() == ".npz":
+        _refuse("--board goes with photographs", board)
+        found = collect_line_set(source, out, name)
+    else:
+        raise click.UsageError(
+            f"{source}: neither a configuration (.yaml), nor a folder of photographs, nor a set of "
+            "lines (.npz)"
+        )
+    zoom = found.record.zooms[0]
+    click.echo(f"{found.folder}: {zoom.lines} lines, {zoom.points} points")
+
+
+def _collect_fleet(config: Path, out: Path) -> None:
+    from torchptz.fleet.calibrate import collect_fleet
+
+    with _fleet_progress() as progress:
+        records = collect_fleet(config, out, progress)
+    for name, record in records.items():
+        lines = sum(zoom.lines for zoom in record.zooms)
+        click.echo(f"{out / name}: {len(record.zooms)} zooms, {lines} lines")
+        if record.error is not None:
+            click.echo(f"failed: {_one_line(record.error)}", err=True)
+    failed = sum(record.error is not None for record in records.values())
+    _exit(failed == 0, failed == len(records))
+
+
+@main.command()
+@click.argument("run", type=_OUT)
+@_powers
+@click.option("--without-offsets", is_flag=True, help="Ignore the points' known offsets.")
+def solve(run: Path, powers: tuple[float, ...], without_offsets: bool) -> None:
+    """Estimate the lenses of all cameras and zooms collected in RUN; write a table for each."""
+    from torchptz.fleet.solve import solve
+
+    summary = solve(run, powers, offsets=not without_offsets)
+    _print_summary(summary, run)
+    _exit(summary.all_ok, summary.none_ok)
+
+
+@main.command()
+@click.argument("config", type=_FILE)
+@click.option("--out", "-o", type=_OUT, required=True, help="Folder of the run.")
+@_powers
+def calibrate(config: Path, out: Path, powers: tuple[float, ...]) -> None:
+    """Collect and solve the fleet of CONFIG: one table of lenses a camera."""
+    from torchptz.fleet.calibrate import calibrate
+
+    with _fleet_progress() as progress:
+        summary = calibrate(config, out, powers, progress)
+    _print_summary(summary, out)
+    _exit(summary.all_ok, summary.none_ok)
+
+
+@main.command()
+@click.argument("table", type=_FILE)
+@click.argument("pictures", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--out", "-o", type=_OUT, required=True, help="Folder for the rectified pictures.")
+@click.option("--zoom", type=float, help="Magnification of the pictures; 1 = widest.")
+@click.option("--zoom-units", type=float, help="Or their zoom in the camera's own units.")
+@click.option(
+    "--canvas",
+    type=click.Choice(["same", "all", "valid"]),
+    default="same",
+    show_default=True,
+    help="Size of the picture; or as large as all of it needs; or nothing but picture.",
+)
+@click.option("--extrapolate", is_flag=True, help="Beyond the table's zooms, use the nearest one.")
+def rectify(
+    table: Path,
+    pictures: tuple[Path, ...],
+    out: Path,
+    zoom: float | None,
+    zoom_units: float | None,
+    canvas: str,
+    extrapolate: bool,
+) -> None:
+    """Remove the distortion from PICTURES (files or folders) with a camera's TABLE."""
+    _quiet_decoders()
+    from torchptz.fleet.pictures import rectify_pictures
+    from torchptz.zoom_table import ZoomTable
+
+    with _counting("pictures") as progress:
+        done = rectify_pictures(
+            ZoomTable.load(table),
+            pictures,
+            out,
+            zoom=zoom,
+            zoom_units=zoom_units,
+            canvas=canvas,
+            extrapolate=extrapolate,
+            progress=progress,
+        )
+    for path, reason in done.failed.items():
+        click.echo(f"failed: {path}: {_one_line(reason)}", err=True)
+    click.echo(f"{len(done.written)} pictures rectified into {out}")
+    _exit(not done.failed, not done.written)
+
+
+@main.command()
+@click.argument("config", type=_FILE)
+@click.option("--truth", type=click.Path(dir_okay=False, path_type=Path), help="Write the truth.")
+@click.option(
+    "--ready-file",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Write the addresses (JSON) once all cameras answer.",
+)
+def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
+    """Serve the simulated cameras of CONFIG until interrupted."""
+    from torchptz.fleet.records import write_whole
+    from torchptz.simulation import serve
+
+    def announce(addresses: dict[str, str]) -> None:
+        for name, address in addresses.items():
+            click.echo(f"{name}: {address}")
+        click.echo("serving; Ctrl-C ends it", err=True)
+        if ready_file is not None:
+            write_whole(ready_file, json.dumps(addresses) + "\n")
+
+    serve(config, truth, announce)
+
+
+def _print_summary(summary, run: Path) -> None:
+    table = Table(title=f"Lenses of {run}", title_justify="left")
+    for heading in ("camera", "zoom", "units", "status", "rms px", "gain", "centre", "points"):
+        table.add_column(heading, justify="left" if heading in ("camera", "status") else "right")
+    for name, camera in summary.cameras.items():
+        for zoom in camera.zooms:
+            table.add_row(
+                name,
+                f"{zoom.magnification:.4g}",
+                "" if zoom.zoom_units is None else f"{zoom.zoom_units:g}",
+                "failed" if zoom.status is None else zoom.status.lower().replace("_", " "),
+                "" if zoom.rms_px is None else f"{zoom.rms_px:.3f}",
+                "" if zoom.gain is None else f"{zoom.gain:.3f} ± {zoom.gain_sigma or 0:.3f}",
+                "" if zoom.center is None else f"{zoom.center[0]:.1f}, {zoom.center[1]:.1f}",
+                str(zoom.points),
+            )
+        if not camera.zooms:
+            table.add_row(name, "", "", "failed", "", "", "", "0")
+    console = Console()
+    # In a file or a pipe there is no terminal whose width would be a reason to cut.
+    console.print(table, width=None if console.is_terminal else 120)
+    for name, camera in summary.cameras.items():
+        if camera.error is not None:
+            click.echo(f"{name}: {_one_line(camera.error)}", err=True)
+        for zoom in camera.zooms:
+            if zoom.error is not None:
+                click.echo(f"{name}, zoom {zoom.magnification:.4g}: {zoom.error}", err=True)
+
+
+@contextmanager
+def _fleet_progress() -> Iterator[Callable[[str, str, int, int], None]]:
+    """One bar a camera; called from the cameras' threads."""
+    with _bars() as bars:
+        tasks: dict[str, int] = {}
+
+        def progress(camera: str, what: str, done: int, total: int) -> None:
+            if camera not in tasks:
+                tasks[camera] = bars.add_task(camera, total=total)
+            bars.update(tasks[camera], description=f"{camera}: {what}", completed=done, total=total)
+
+        yield progress
+
+
+@contextmanager
+def _counting(what: str) -> Iterator[Callable[[int, int], None]]:
+    with _bars() as bars:
+        task = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def _bars() -> Progress:
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def _quiet_decoders() -> None:
+    """OpenCV reports unreadable files on stderr, beside and before our own words."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # read when it is first imported
+
+
+def _refuse(reason: str, *options: object) -> None:
+    if any(option is not None for option in options):
+        raise click.UsageError(reason)
+
+
+def _one_line(message: object) -> str:
+    return " ".join(str(message).split())
+
+
+def _exit(all_ok: bool, none_ok: bool) -> None:
+    if not all_ok:
+        sys.exit(2 if none_ok else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Line step: total least squares lines through corrected points."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Lines(NamedTuple):
+    """Lines in normal form, ``normal . x + offset = 0``."""
+
+    normal: Tensor  # (..., 2), unit
+    offset: Tensor  # (...), px
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Signed distance (..., P) px of points (..., P, 2)."""
+        return (points * self.normal.unsqueeze(-2)).sum(-1) + self.offset.unsqueeze(-1)
+
+    @property
+    def direction(self) -> Tensor:
+        """(..., 2), unit: the normal turned by a quarter."""
+        return torch.stack([-self.normal[..., 1], self.normal[..., 0]], -1)
+
+
+def fit_lines(points: Tensor, weight: Tensor) -> Lines:
+    """Total least squares lines by batched SVD.
+
+    Args:
+        points: (..., P, 2) px.
+        weight: (..., P), 0 leaves a point out. Lines without points come back as some line, lines
+            through points that are not finite as NaN.
+
+    Returns:
+        Lines of shape (...).
+
+    Source: paper, section 2, first step. The normal is the right singular vector of the smaller
+    singular value of the centred points.
+    """
+    total = weight.sum(-1, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    mean = (weight.unsqueeze(-1) * points).sum(-2) / total
+    centered = weight.sqrt().unsqueeze(-1) * (points - mean.unsqueeze(-2))
+    # One matrix that is not finite makes the SVD of the whole batch raise.
+    finite = centered.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+    axes = torch.linalg.svd(torch.where(finite, centered, 0.0), full_matrices=False).Vh
+    normal = torch.where(finite, axes, torch.nan)[..., -1, :]
+    return Lines(normal, -(normal * mean).sum(-1))
+
+
+def project_out_lines(
+    columns: Tensor, weight: Tensor, points: Tensor, lines: Lines, gradient: Tensor | None = None
+) -> Tensor:
+    """The part of per-point columns that refitting the lines cannot take up.
+
+    A line has two parameters: its offset moves all residuals alike, its turn moves them in
+    proportion to the place along the line. Both columns are projected out, weighted.
+
+    Args:
+        columns: (..., P, M) derivatives of the residuals, or the residuals themselves (M = 1).
+        weight: (..., P).
+        points: (..., P, 2) px, corrected points.
+        lines: their lines.
+        gradient: (..., P) divisor of each residual (`residuals.gradient_norm`), default 1.
+
+    Returns:
+        (..., P, M), zero where the weight is.
+
+    Source: variable projection (Golub and Pereyra) for the lines of paper, section 2.
+    """
+    root = weight.sqrt().unsqueeze(-1)
+    level = root if gradient is None else root / gradient.unsqueeze(-1)
+    total = (level**2).sum(-2, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    along = (points * lines.direction.unsqueeze(-2)).sum(-1, keepdim=True)
+    along = along - (level**2 * along).sum(-2, keepdim=True) / total
+    tilt = level * along
+    scaled = columns * root
+    for basis in (level, tilt):  # orthogonal by construction
+        squared = (basis**2).sum(-2, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+        scaled = scaled - basis * (basis * scaled).sum(-2, keepdim=True) / squared
+    return scaled

@@ -1,0 +1,96 @@
+"""What became of an estimate, with a reason a person can act on."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import torch
+from torch import Tensor
+
+from torchptz.estimation.problem import Problem
+from torchptz.lens import RadialLens
+
+# A centre known no better than this part of the half width is not known.
+CENTER_SIGMA_LIMIT = 0.25
+# A correction at the image's farthest corner known no better than this, in px, is not known.
+CORNER_SIGMA_LIMIT_PX = 5.0
+
+
+class Status(Enum):
+    """Outcome of one item; the value says what to do about it."""
+
+    OK = "ok"
+    TOO_FEW_LINES = "too few lines or points for the unknowns: scan more lines"
+    CENTER_UNOBSERVABLE = (
+        "the centre cannot be told from these lines (next to no distortion): it was kept at its "
+        "start"
+    )
+    DISTORTION_UNOBSERVABLE = (
+        "the distortion cannot be told from these lines (all pass near the centre, or cover too "
+        "little of the picture): scan lines far from the centre"
+    )
+    NOT_MONOTONIC = (
+        "the estimated lens folds inside the picture: use fewer powers, or scan nearer the corners"
+    )
+    NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
+
+
+def too_few(problem: Problem) -> Tensor:
+    """(B,) bool: fewer degrees of freedom than unknowns, or lines in too few places."""
+    unknowns = 2 + len(problem.powers) + (problem.offsets is not None)
+    return (problem.line_count < 3) | (problem.count - 2 * problem.line_count - unknowns < 1)
+
+
+def center_sigma(covariance: Tensor) -> Tensor:
+    """(B,) px, standard deviation of the centre in its least known direction."""
+    block = covariance[:, :2, :2]
+    known = block.isfinite().all((1, 2))
+    safe = torch.where(known[:, None, None], block, 0.0)
+    largest = torch.linalg.eigvalsh(safe)[:, -1].clamp_min(0).sqrt()
+    return torch.where(known, largest, torch.inf)
+
+
+def corner_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
+    """(B,) px, standard deviation of ``r L(r)`` at the farthest corner for a known centre.
+
+    Lines say nothing about a projective change of the picture, yet with L(0) = 1 and the centre
+    held what is left of it in a radial correction is small.
+    """
+    radius = lens.farthest_corner() / lens.scale
+    lever = lens.scale[:, None] * radius[:, None] ** (lens.powers + 1)
+    block = covariance[:, 2 : 2 + lens.powers.numel(), 2 : 2 + lens.powers.numel()]
+    known = block.isfinite().all((1, 2))
+    variance = torch.einsum("bi,bij,bj->b", lever, block.nan_to_num(0.0, 0.0, 0.0), lever)
+    return torch.where(known, variance.clamp_min(0).sqrt(), torch.inf)
+
+
+def judge(
+    problem: Problem, lens: RadialLens, covariance: Tensor, converged: Tensor, held: Tensor
+) -> list[Status]:
+    """Status of each item, the most basic failure first.
+
+    Args:
+        problem: B items.
+        lens: their lenses.
+        covariance: (B, M, M).
+        converged: (B,) bool.
+        held: (B,) bool, items whose centre was found unobservable and kept at its start.
+
+    Returns:
+        B members of Status.
+    """
+    reasons = [
+        (Status.TOO_FEW_LINES, too_few(problem)),
+        (
+            Status.DISTORTION_UNOBSERVABLE,
+            ~(corner_sigma(lens, covariance) <= CORNER_SIGMA_LIMIT_PX),
+        ),
+        (Status.NOT_CONVERGED, ~converged),
+        (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
+        (Status.CENTER_UNOBSERVABLE, held),
+    ]
+    statuses = [Status.OK] * len(lens)
+    for status, applies in reversed(reasons):
+        flags = applies.tolist()
+        statuses = [status if flag else old for flag, old in zip(flags, statuses, strict=True)]
+    return statuses

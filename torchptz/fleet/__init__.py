@@ -1,0 +1,1 @@
+"""Many cameras: configuration, collection, solution."""

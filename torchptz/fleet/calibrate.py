@@ -1,0 +1,51 @@
+"""A fleet from its configuration to its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchptz.fleet.collector import Progress
+from torchptz.fleet.config import FleetConfig, load_config
+from torchptz.fleet.driver import collect
+from torchptz.fleet.records import CameraRecord
+from torchptz.fleet.solve import Summary, solve
+
+CONFIG_NAME = "config.yaml"
+
+
+def collect_fleet(
+    config: FleetConfig | str | Path, out: str | Path, progress: Progress = lambda *_: None
+) -> dict[str, CameraRecord]:
+    """Collect the patterns of a fleet, and keep its configuration (no passwords) beside them.
+
+    config: a configuration, or its file. out: folder of the run. progress: see `collect`.
+
+    Returns:
+        Records by name; a camera that failed has an ``error`` in it.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+    if not isinstance(config, FleetConfig):
+        config = load_config(config)
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    config.save(out / CONFIG_NAME)
+    return collect(config, out, progress)
+
+
+def calibrate(
+    config: FleetConfig | str | Path,
+    out: str | Path,
+    powers: Sequence[float] = (1, 2, 3),
+    progress: Progress = lambda *_: None,
+) -> Summary:
+    """Calibrate a fleet: `collect_fleet`, then `solve`.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+        ValueError: what `solve` refuses.
+    """
+    collect_fleet(config, out, progress)
+    return solve(out, powers)

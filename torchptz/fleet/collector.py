@@ -1,0 +1,313 @@
+"""Collects the virtual patterns of one camera, from the first look to the last line."""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchptz.cameras import Camera, CameraError, Pose, open_camera
+from torchptz.estimation import estimate_magnification, estimate_principal_point
+from torchptz.fleet.config import CameraConfig
+from torchptz.fleet.journal import Journal
+from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
+from torchptz.patterns import LinePatterns
+from torchptz.scanning.approach import Approach, approach
+from torchptz.scanning.line_scan import ScannedLine, View, plan_lines, scan_pattern
+from torchptz.scanning.observation import Observation, Observer, Stopped
+from torchptz.scanning.prediction import ImagePredictor
+from torchptz.scanning.ray import FeatureRay, estimate_ray
+from torchptz.scanning.zoom_tracks import scan_tracks, track_levels
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, str, int, int], None]  # camera, what, done, total
+
+# Quanta by which the head is moved to either side of the feature's ray at the longest zoom: enough
+# to average its rounding, little enough to stay where the lens hardly bends.
+_RAY_QUANTA = 3
+_RAY_STEP = math.radians(0.05)  # for heads without a known quantum
+_WIDEST_OVERSCAN = 1.08  # of the undistorted picture over the real one, before anything is seen
+
+
+class Collector:
+    """One camera's collection; everything measured is on disk as soon as it is.
+
+    Args:
+        config: of the camera.
+        folder: of the camera in the run.
+        stop: set to end the collection; the head is still sent back.
+        progress: called with (camera, what, done, total).
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        folder: Path,
+        stop: threading.Event,
+        progress: Progress = lambda *_: None,
+    ) -> None:
+        self._config = config
+        self._folder = folder
+        self._stop = stop
+        self._progress = progress
+        self._image_size = (0, 0)
+
+    def run(self) -> CameraRecord:
+        """Collect all zoom levels.
+
+        Returns:
+            The record, as stored. A failure is in its ``error`` (the camera's) or in that of a
+            zoom level; what was collected before it is kept.
+        """
+        config = self._config
+        record = CameraRecord(name=config.name, pixel_aspect=config.pixel_aspect)
+        journal = Journal(self._folder)
+        camera: Camera | None = None
+        start: Pose | None = None
+        try:
+            self._tell("connecting", 0, 1)
+            camera = open_camera(
+                config.dialect,
+                config.name,
+                config.address,
+                config.resolve_credentials(),
+                **_driver_options(config),
+            )
+            start = camera.position()
+            camera.prepare()
+            self._collect(camera, journal, record)
+            record.finished = True
+        except Stopped:
+            record.error = "stopped before it was finished"
+        except (CameraError, ValueError, OSError) as error:
+            record.error = str(error)
+        except Exception as error:
+            # A defect of ours must cost one camera, not the fleet's results.
+            logger.exception("camera %s: unexpected failure", config.name)
+            record.error = f"camera {config.name}: unexpected {type(error).__name__}: {error}"
+        finally:
+            if camera is not None:
+                _put_back(camera, start)
+            journal.close()
+            record.save(self._folder)
+            self._tell("failed" if record.error else "done", 1, 1)
+        return record
+
+    def _collect(self, camera: Camera, journal: Journal, record: CameraRecord) -> None:
+        config = self._config
+        timing = config.timing
+        observer = Observer(
+            camera, journal.write, self._stop, timing.settle_timeout_s, timing.poll_interval_s
+        )
+        frame = camera.snapshot()
+        self._image_size = (frame.shape[1], frame.shape[0])
+        record.image_size = self._image_size
+
+        self._tell("finding the feature", 0, 1)
+        found = approach(observer, self._image_size, _direction(config), config.pixel_aspect)
+        looks = self._look_around(observer, found)
+        middle = torch.tensor(self._image_size, dtype=torch.float64) / 2 - 0.5
+        rough = self._ray(looks, middle, found.focal_length, 0.0)
+
+        zooms = [camera.zoom_units(magnification) for magnification in config.zooms]
+        levels = track_levels(camera, zooms)
+        self._tell("following zoom tracks", 0, 1)
+        tracks = scan_tracks(
+            observer,
+            levels,
+            rough.ray,
+            rough.focal_length,
+            found.radius,
+            self._image_size,
+            config.scan.tracks,
+            config.pixel_aspect,
+        )
+        points = torch.from_numpy(tracks.points)[None]
+        mask = points.isfinite().all(-1)
+        points = points.nan_to_num(0.0)
+        meeting = estimate_principal_point(points, mask)
+        if not bool(meeting.covariance.isfinite().all()):
+            raise CameraError(
+                f"camera {config.name}: the zoom tracks do not meet in a point; the feature was "
+                f"found {int(mask.sum())} times on {config.scan.tracks} tracks"
+            )
+        pp, covariance = meeting.position[0], meeting.covariance[0]
+        magnification, magnification_sigma = estimate_magnification(points, mask, pp[None])
+        ray = self._ray(looks, pp, rough.focal_length, float(covariance.diagonal().max().sqrt()))
+        record.principal_point = pp.tolist()
+        record.principal_point_covariance = covariance.tolist()
+        record.ray, record.ray_sigma = ray.ray.tolist(), ray.ray_sigma
+        record.feature = config.feature.model_dump()
+        record.save(self._folder)
+
+        for index, zoom in enumerate(zooms):
+            level = levels.index(zoom)
+            relative = float(magnification[0, level] / magnification[0, -1])
+            zoom_record = ZoomRecord(
+                zoom_units=zoom,
+                magnification=float(magnification[0, level]),
+                magnification_sigma=float(magnification_sigma[0, level]),
+                focal_length_px=ray.focal_length * relative,
+                focal_length_sigma_px=ray.focal_length_sigma * relative,
+            )
+            record.zooms.append(zoom_record)
+            radius = tracks.radius[level]
+            view = View(
+                image_size=self._image_size,
+                principal_point=pp.numpy(),
+                focal_length=ray.focal_length * relative,
+                pixel_aspect=config.pixel_aspect,
+                zoom=zoom,
+                radius=float(radius if np.isfinite(radius) else found.radius * relative),
+            )
+            self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
+
+    def _collect_zoom(
+        self,
+        observer: Observer,
+        view: View,
+        ray: torch.Tensor,
+        index: int,
+        zoom_record: ZoomRecord,
+        record: CameraRecord,
+    ) -> None:
+        scan = self._config.scan
+        what = f"zoom {index + 1}/{len(self._config.zooms)} ({zoom_record.magnification:.2f}x)"
+        predictor = ImagePredictor(view.image_size, view.principal_point)
+        cross = (1, 1, 0)
+        rest = (scan.horizontal - 1, scan.vertical - 1, scan.oblique)
+        total, done = sum(cross) + sum(rest), 0
+        lines: list[ScannedLine] = []
+        try:
+            # The middle lines come first: they show how far beyond the frame the outer ones of
+            # the undistorted picture may lie.
+            for counts in (cross, rest):
+                plan = plan_lines(
+                    view,
+                    ray,
+                    observer.camera.capabilities,
+                    *counts,
+                    scan.points_per_line,
+                    predictor.overscan(view.margin) if done else _WIDEST_OVERSCAN,
+                )
+                scanned = scan_pattern(
+                    observer,
+                    view,
+                    ray,
+                    plan,
+                    predictor,
+                    index,
+                    done,
+                    lambda count: self._tell(what, count, total),
+                )
+                for line in scanned:
+                    lines.append(line)
+                    zoom_record.patterns = save_patterns(self._folder, index, self._patterns(lines))
+                    zoom_record.lines = len(lines)
+                    zoom_record.points = sum(len(one.points) for one in lines)
+                    record.save(self._folder)
+                done += len(plan.planes)
+            if not lines:
+                zoom_record.error = "no line with at least 3 points was seen"
+        except CameraError as error:
+            zoom_record.error = str(error)
+            raise
+        finally:
+            record.save(self._folder)
+
+    def _look_around(self, observer: Observer, found: Approach) -> list[Observation]:
+        """The feature at nine poses around the middle of the picture, at the longest zoom."""
+        can = observer.camera.capabilities
+        pan_step = _RAY_QUANTA * can.pan_quantum or _RAY_STEP
+        tilt_step = _RAY_QUANTA * can.tilt_quantum or _RAY_STEP
+        # A coarse quantum at a very long zoom must not drive the feature out of the picture.
+        room = 0.3 * min(self._image_size) / found.focal_length
+        pan_step, tilt_step = min(pan_step, room), min(tilt_step, room)
+        looks = []
+        for number, (x, y) in enumerate((x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)):
+            self._tell("reading the ray", number, 9)
+            pose = Pose(
+                *can.nearest_reachable(
+                    found.pose.pan + x * pan_step, found.pose.tilt + y * tilt_step
+                ),
+                found.pose.zoom,
+            )
+            moved = found.focal_length * np.array([x * pan_step, -y * tilt_step])
+            middle = (np.asarray(self._image_size) - 1) / 2
+            seen = observer.look(
+                pose,
+                "ray",
+                near=tuple(middle + moved),
+                search_radius=0.3 * min(self._image_size),
+                expected_radius=found.radius,
+            )
+            if seen.found:
+                looks.append(seen)
+        return looks
+
+    def _ray(
+        self, looks: list[Observation], pp: torch.Tensor, focal_length: float, pp_sigma: float
+    ) -> FeatureRay:
+        if len(looks) < 5:
+            raise CameraError(
+                f"camera {self._config.name}: the feature was found at only {len(looks)} of 9 "
+                "poses at the longest zoom; its ray cannot be trusted. Is something in front of it?"
+            )
+
+        def tensor(values: list) -> torch.Tensor:
+            return torch.tensor(values, dtype=torch.float64)
+
+        return estimate_ray(
+            tensor([one.read_after.pan for one in looks]),
+            tensor([one.read_after.tilt for one in looks]),
+            tensor([one.pixel for one in looks]),
+            pp,
+            focal_length,
+            pp_sigma,
+            self._config.pixel_aspect,
+        )
+
+    def _patterns(self, lines: list[ScannedLine]) -> LinePatterns:
+        return LinePatterns.from_lists(
+            [[line.points for line in lines]],
+            self._image_size,
+            [[line.offsets for line in lines]],
+            [[line.sigma for line in lines]],
+        )
+
+    def _tell(self, what: str, done: int, total: int) -> None:
+        self._progress(self._config.name, what, done, total)
+
+
+def _driver_options(config: CameraConfig) -> dict[str, object]:
+    return {
+        "pan_sign": config.pan_sign,
+        "tilt_sign": config.tilt_sign,
+        "connect_timeout_s": config.timing.connect_timeout_s,
+        "read_timeout_s": config.timing.read_timeout_s,
+    }
+
+
+def _direction(config: CameraConfig) -> tuple[float, float] | None:
+    """Where the feature was said to be, rad."""
+    pan, tilt = config.feature.pan_deg, config.feature.tilt_deg
+    return None if pan is None or tilt is None else (math.radians(pan), math.radians(tilt))
+
+
+def _put_back(camera: Camera, start: Pose | None) -> None:
+    """Send the head back to where it was found, and undo what was switched. Never raises."""
+    for action in (
+        lambda: camera.restore(),
+        lambda: camera.move(start) if start is not None else None,
+        lambda: camera.close(),
+    ):
+        try:
+            action()
+        except CameraError as error:
+            logger.warning("while putting it back: %s", error)

@@ -1,0 +1,1 @@
+"""The virtual pattern: where to point the head, and what to find in its pictures."""

@@ -1,0 +1,246 @@
+"""One look at a feature, taken with the head at rest."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchptz.cameras import Camera, MotionError, Pose
+from torchptz.scanning.detection import Detection, NotFound, detect_ball
+from torchptz.scanning.stillness import pictures_still
+
+_MOST_PICTURES = 12  # per look; a picture that moves for longer will not come to rest
+_STILL_PX = 0.5  # the feature's largest move between two pictures of a head at rest
+# A head that has not arrived and does not move any more is given this long to start.
+_PATIENCE_S = 2.0
+_ARRIVAL_QUANTA = 1.5
+_ZOOM_ARRIVAL = 0.003  # of the zoom range
+
+
+class Stopped(Exception):
+    """The run was asked to stop."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One look at a feature, with all that later estimators may want to know of it."""
+
+    purpose: str  # "locate", "ray", "track" or "line"
+    zoom_index: int  # zoom level for "line", track level for "track", else -1
+    group: int  # line or track number, else 0
+    commanded: Pose  # rad, rad, device units
+    read_before: Pose  # as read once the head was at rest
+    read_after: Pose  # as read after the pictures
+    pixel: tuple[float, float] | None  # px, None where the feature was not found
+    sigma: float | None  # px per axis
+    radius: float | None  # px
+    quality: float | None  # 0..1
+    reason: str | None  # why it was not found
+    rest_rule: str  # what showed that the head was at rest
+    taken_at: float  # s since the epoch
+
+    @property
+    def found(self) -> bool:
+        """Whether the feature was found."""
+        return self.pixel is not None
+
+
+class Observer:
+    """Moves a camera, waits until it is at rest and looks for the feature.
+
+    What a device says of its own motion is not trusted: the head is at rest when two readings
+    agree, it is where it was sent, and two pictures in a row show the same.
+
+    Args:
+        camera: connected camera.
+        record: called with every observation.
+        stop: set by others to end the run; raises Stopped at the next step.
+        settle_timeout_s: longest wait for a head to arrive.
+        poll_interval_s: between two readings.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        record: Callable[[Observation], None],
+        stop: threading.Event,
+        settle_timeout_s: float = 20.0,
+        poll_interval_s: float = 0.05,
+    ) -> None:
+        self.camera = camera
+        self._record = record
+        self._stop = stop
+        self._timeout = settle_timeout_s
+        self._poll = poll_interval_s
+
+    def go(self, pose: Pose) -> Pose:
+        """Send the head to a pose and wait until its readings are stable there.
+
+        Returns:
+            The reading.
+
+        Raises:
+            MotionError: it did not move, stopped elsewhere or never came to rest.
+        """
+        started = time.monotonic()
+        self.camera.move(pose)
+        first = previous = None
+        while True:
+            if self._stop.is_set():
+                raise Stopped
+            reading = self.camera.position()
+            first = first or reading
+            waited = time.monotonic() - started
+            if previous is not None and self._same(reading, previous):
+                if self._arrived(reading, pose):
+                    return reading
+                if waited > min(_PATIENCE_S, self._timeout):
+                    raise MotionError(self._not_there(pose, reading, moved=reading != first))
+            if waited > self._timeout:
+                raise MotionError(
+                    f"{self._name}: the head was still moving {self._timeout:g} s after a move; "
+                    "is a tour or another user driving it? (timing.settle_timeout_s)"
+                )
+            previous = reading
+            time.sleep(self._poll)
+
+    def look(
+        self,
+        pose: Pose,
+        purpose: str,
+        *,
+        zoom_index: int = -1,
+        group: int = 0,
+        near: tuple[float, float] | None = None,
+        search_radius: float | None = None,
+        expected_radius: float | None = None,
+    ) -> Observation:
+        """Go to a pose and measure the feature in two pictures that agree.
+
+        Args:
+            pose: where to go.
+            purpose, zoom_index, group: written down with the observation.
+            near, search_radius, expected_radius: px, see `detect_ball`.
+
+        Returns:
+            Observation, also of a feature that was not found.
+
+        Raises:
+            MotionError: the head or the picture does not come to rest.
+        """
+        before = self.go(pose)
+        last: tuple[np.ndarray, Detection | NotFound] | None = None
+        for _ in range(_MOST_PICTURES):
+            if self._stop.is_set():
+                raise Stopped
+            frame = self.camera.snapshot()
+            seen = detect_ball(
+                frame, near=near, search_radius=search_radius, expected_radius=expected_radius
+            )
+            if last is None or not _agree(last, (frame, seen)):
+                last = (frame, seen)
+                continue
+            after = self.camera.position()
+            if self._same(before, after):
+                return self._observation(
+                    pose, before, after, last[1], seen, purpose, zoom_index, group
+                )
+            before, last = after, None  # somebody moved it between the pictures: begin again
+        raise MotionError(
+            f"{self._name}: the picture did not come to rest in {_MOST_PICTURES} pictures; is the "
+            "feature swinging, the mast shaking, or the image stabiliser on?"
+        )
+
+    @property
+    def _name(self) -> str:
+        return f"camera {self.camera.name}"
+
+    def _observation(
+        self,
+        pose: Pose,
+        before: Pose,
+        after: Pose,
+        first: Detection | NotFound,
+        second: Detection | NotFound,
+        purpose: str,
+        zoom_index: int,
+        group: int,
+    ) -> Observation:
+        pixel = sigma = radius = quality = reason = None
+        if isinstance(first, Detection) and isinstance(second, Detection):
+            mean = (np.asarray(first.position) + np.asarray(second.position)) / 2
+            pixel = (float(mean[0]), float(mean[1]))
+            # Compression and texture err alike in both pictures; only sensor noise averages out.
+            sigma = float(max(first.sigma, second.sigma) * 0.85)
+            radius = float((first.radius + second.radius) / 2)
+            quality = float(min(first.quality, second.quality))
+        elif isinstance(second, NotFound):
+            reason = second.reason
+        observation = Observation(
+            purpose=purpose,
+            zoom_index=zoom_index,
+            group=group,
+            commanded=pose,
+            read_before=before,
+            read_after=after,
+            pixel=pixel,
+            sigma=sigma,
+            radius=radius,
+            quality=quality,
+            reason=reason,
+            rest_rule="readings agree at the target, pictures agree",
+            taken_at=time.time(),
+        )
+        self._record(observation)
+        return observation
+
+    def _same(self, a: Pose, b: Pose) -> bool:
+        """Whether two readings are the same to within a small part of the quanta."""
+        can = self.camera.capabilities
+        pan = abs(math.remainder(a.pan - b.pan, 2 * math.pi))
+        return (
+            pan <= 0.1 * max(can.pan_quantum, 1e-6)
+            and abs(a.tilt - b.tilt) <= 0.1 * max(can.tilt_quantum, 1e-6)
+            and a.zoom == b.zoom
+        )
+
+    def _arrived(self, reading: Pose, pose: Pose) -> bool:
+        can = self.camera.capabilities
+        pan = abs(math.remainder(reading.pan - pose.pan, 2 * math.pi))
+        zoom_range = can.zoom_limits[1] - can.zoom_limits[0]
+        return (
+            pan <= _ARRIVAL_QUANTA * max(can.pan_quantum, 1e-4)
+            and abs(reading.tilt - pose.tilt) <= _ARRIVAL_QUANTA * max(can.tilt_quantum, 1e-4)
+            and abs(reading.zoom - pose.zoom) <= _ZOOM_ARRIVAL * zoom_range
+        )
+
+    def _not_there(self, pose: Pose, reading: Pose, moved: bool) -> str:
+        def text(p: Pose) -> str:
+            return (
+                f"pan {math.degrees(p.pan):.2f}°, tilt {math.degrees(p.tilt):.2f}°, "
+                f"zoom {p.zoom:.0f}"
+            )
+
+        what = "stopped elsewhere" if moved else "does not move"
+        return (
+            f"{self._name}: the head {what}: sent to {text(pose)}, reads {text(reading)}; is it "
+            "blocked, at a stop, locked by another user, or in exclusive control mode?"
+        )
+
+
+def _agree(
+    last: tuple[np.ndarray, Detection | NotFound], now: tuple[np.ndarray, Detection | NotFound]
+) -> bool:
+    """Whether two pictures in a row show the same."""
+    a, b = last[1], now[1]
+    if isinstance(a, Detection) and isinstance(b, Detection):
+        moved = float(np.linalg.norm(np.asarray(a.position) - np.asarray(b.position)))
+        return moved <= _STILL_PX + 4 * max(a.sigma, b.sigma)
+    if isinstance(a, NotFound) and isinstance(b, NotFound):
+        return pictures_still(last[0], now[0], _STILL_PX)
+    return False

@@ -1,0 +1,23 @@
+"""Simulated pan-tilt-zoom cameras behind real HTTP, with lenses whose truth is known."""
+
+from .camera import SimulatedCamera
+from .comparison import compare_lens
+from .config import CameraConfig, SimulationConfig, SimulationError
+from .fleet import SimulatedFleet, serve
+from .truth import CameraTruth, TruthComparison, load_truth, write_truth
+from .view import HeadPose
+
+__all__ = [
+    "CameraConfig",
+    "CameraTruth",
+    "HeadPose",
+    "SimulatedCamera",
+    "SimulatedFleet",
+    "SimulationConfig",
+    "SimulationError",
+    "TruthComparison",
+    "compare_lens",
+    "load_truth",
+    "serve",
+    "write_truth",
+]

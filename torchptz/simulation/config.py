@@ -1,0 +1,171 @@
+"""Configuration of a simulated fleet: what stands where, and what is wrong with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+Pair = tuple[float, float]
+
+
+class SimulationError(RuntimeError):
+    """A simulated fleet cannot be configured or started; the message says why and the way out."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class LensConfig(_Section):
+    """The optics. What is left out is drawn from the camera's seed."""
+
+    f_wide_px: PositiveFloat | None = None  # about 738 px for 736 px of width
+    max_magnification: Annotated[float, Field(gt=1, le=60)] = 25.0
+    principal_point_offset_px: Pair | None = None  # from the image centre
+    barrel_wide: Annotated[float, Field(ge=0, le=0.12)] | None = None  # share of r at a corner, 1x
+    pincushion_tele: Annotated[float, Field(ge=0, le=0.05)] | None = None  # the same, longest zoom
+    centre_drift_px: NonNegativeFloat | None = None  # distortion centre from the principal point
+
+
+class BallConfig(_Section):
+    """The bright ball that the cameras look at; directions in the head's signs (left, down > 0)."""
+
+    pan_deg: float = 0.0
+    tilt_deg: float = 10.0
+    distance_m: PositiveFloat = 12.0
+    radius_m: PositiveFloat = 0.036
+    brightness: Annotated[float, Field(ge=160, le=255)] = 238.0
+    limb_darkening: Annotated[float, Field(ge=0, le=0.6)] = 0.12  # lost at the rim, symmetric
+    side_light: Annotated[float, Field(ge=0, le=0.3)] = 0.0  # lit from above: moves the centroid
+
+
+class BoardConfig(_Section):
+    """A plane checkerboard that faces the camera, turned by three angles about its centre."""
+
+    pan_deg: float = 35.0
+    tilt_deg: float = 12.0
+    distance_m: PositiveFloat = 6.0
+    squares: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3)]] = (11, 8)
+    square_m: PositiveFloat = 0.30
+    yaw_deg: Annotated[float, Field(gt=-70, lt=70)] = 0.0
+    pitch_deg: Annotated[float, Field(gt=-70, lt=70)] = 0.0
+    roll_deg: float = 0.0
+
+
+class HighlightConfig(_Section):
+    """A bright thing that is not the ball: elongated, or of another size; infinitely far away."""
+
+    pan_deg: float
+    tilt_deg: float
+    length_deg: PositiveFloat = 0.9  # full length and width as seen from the head
+    width_deg: PositiveFloat = 0.2
+    angle_deg: float = 0.0  # of the long side, clockwise from the horizontal
+    brightness: Annotated[float, Field(ge=0, le=255)] = 215.0
+
+
+class SceneConfig(_Section):
+    ball: BallConfig = BallConfig()
+    board: BoardConfig | None = BoardConfig()
+    highlights: list[HighlightConfig] | None = None  # None: three, drawn from the seed
+    text: str | None = None  # written into the picture's corner, as cameras do
+    plain_background: Annotated[float, Field(ge=0, le=150)] | None = None  # DN; None: texture
+
+
+class HeadConfig(_Section):
+    """Mechanics and imperfections. Everything that is an imperfection is zero by default."""
+
+    speed_up: PositiveFloat = 1.0  # all the head's times are divided by this
+    pan_units_per_deg: PositiveFloat = 14.4  # the head stops at multiples of 1/this
+    tilt_units_per_deg: PositiveFloat = 1800 / 115
+    acceleration_deg: PositiveFloat = 600.0  # deg/s^2
+    zoom_units_per_s: PositiveFloat = 5500.0
+    zoom_delay_s: NonNegativeFloat = 0.1
+    ring_deg: NonNegativeFloat = 0.05  # swing after arrival, gone after ring_time_s
+    ring_time_s: PositiveFloat = 0.4
+
+    boresight_deg: Pair = (0.0, 0.0)  # optical axis turned left, down inside the moving frame
+    tilt_zero_deg: float = 0.0  # true tilt minus the reading
+    roll_deg: float = 0.0  # picture content turned clockwise
+    entrance_pupil_m: float = 0.0  # ahead of the point where the two axes meet
+    pixel_aspect: Annotated[float, Field(gt=0.5, lt=2)] = 1.0  # pixel width / height = fy / fx
+    reading_jitter: NonNegativeFloat = 0.0  # true stop - reading, uniform over so many quanta
+    backlash_deg: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0)  # play, pan and tilt
+    principal_point_drift_px: Pair = (0.0, 0.0)  # from the widest to the longest zoom
+
+
+class FaultConfig(_Section):
+    """What goes wrong on the wire or in the head; each may also be switched at run time."""
+
+    truncated_jpeg_every: Annotated[int, Field(ge=0)] = 0  # every Nth picture ends half-way
+    ball_hidden: bool = False
+    head_stuck: bool = False  # accepts pan and tilt commands and does not move
+    refuse_connections: bool = False  # does not listen
+    double_cr: bool = False  # header lines end in CR CR LF
+    slow_reply_s: NonNegativeFloat = 0.0  # every reply waits so long (wall clock)
+
+
+class CameraConfig(_Section):
+    name: Annotated[str, Field(min_length=1)]
+    dialect: Literal["sony_rz30"] = "sony_rz30"
+    port: Annotated[int, Field(ge=0, le=65535)] = 0  # 0: any free port
+    image_size: tuple[Annotated[int, Field(ge=64)], Annotated[int, Field(ge=64)]] = (736, 544)
+    user: str | None = "admin"  # None: no login asked
+    password: str = Field(default="admin", repr=False)
+    seed: Annotated[int, Field(ge=0)] = 0
+    digital_zoom: bool = True  # state at power-on
+    noise_dn: NonNegativeFloat = 2.0  # sensor noise, one sigma
+    psf_px: NonNegativeFloat = 0.5  # the lens's blur, one sigma
+    jpeg_quality: Annotated[int, Field(ge=10, le=100)] = 90
+    lens: LensConfig = LensConfig()
+    scene: SceneConfig = SceneConfig()
+    head: HeadConfig = HeadConfig()
+    faults: FaultConfig = FaultConfig()
+
+
+class SimulationConfig(_Section):
+    """A fleet of simulated cameras."""
+
+    cameras: Annotated[list[CameraConfig], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> SimulationConfig:
+        names = [camera.name for camera in self.cameras]
+        ports = [camera.port for camera in self.cameras if camera.port]
+        for what, values in (("name", names), ("port", ports)):
+            twice = sorted({v for v in values if values.count(v) > 1})
+            if twice:
+                raise ValueError(f"{what} given to more than one camera: {twice}")
+        return self
+
+    @classmethod
+    def load(cls, source: SimulationConfig | dict | str | Path) -> SimulationConfig:
+        """Reads a YAML file, or takes a dictionary or a finished configuration.
+
+        Raises SimulationError if the file is missing or what it says is not a simulated fleet.
+        """
+        if isinstance(source, cls):
+            return source
+        where = "the simulation's configuration"
+        try:
+            if isinstance(source, (str, Path)):
+                where = str(source)
+                source = yaml.safe_load(Path(source).read_text(encoding="utf-8"))
+            return cls.model_validate(source)
+        except OSError as error:
+            raise SimulationError(
+                f"{where}: cannot be read ({error.strerror}); check the path"
+            ) from error
+        except yaml.YAMLError as error:
+            raise SimulationError(f"{where}: is not YAML: {error}") from error
+        except ValidationError as error:
+            faults = "; ".join(
+                f"{'.'.join(map(str, e['loc'])) or 'fleet'}: {e['msg']}" for e in error.errors()
+            )
+            raise SimulationError(
+                f"{where}: {faults}; configs/simulated_fleet.yaml shows every key"
+            ) from error

@@ -1,0 +1,169 @@
+"""The true optics of simulated cameras: a file of formula parameters, and what they evaluate to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from .camera import SimulatedCamera
+from .config import HeadConfig, SimulationError
+from .optics import OPTICAL_UNITS, Optics
+
+SCHEMA, VERSION = "torchptz.truth", 1
+IMPERFECTIONS = (
+    "boresight_deg",
+    "tilt_zero_deg",
+    "roll_deg",
+    "entrance_pupil_m",
+    "pixel_aspect",
+    "reading_jitter",
+    "backlash_deg",
+    "principal_point_drift_px",
+)
+TABLE_MAGNIFICATIONS = (1, 1.5, 2, 3, 5, 8, 12, 18, 25)
+
+
+@dataclass(frozen=True)
+class CameraTruth:
+    """The truth about one camera. Points are (..., 2) px, zoom is in the motor's own units."""
+
+    name: str
+    seed: int
+    optics: Optics
+    head: dict  # imperfections by their names in the configuration
+    ball: dict  # pan_deg, tilt_deg, distance_m, radius_m
+
+    @classmethod
+    def of(cls, camera: SimulatedCamera) -> CameraTruth:
+        head = camera.config.head.model_dump(include=set(IMPERFECTIONS))
+        ball = camera.config.scene.ball.model_dump(
+            include={"pan_deg", "tilt_deg", "distance_m", "radius_m"}
+        )
+        return cls(camera.name, camera.config.seed, camera.optics, head, ball)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.optics.image_size
+
+    def undistort(self, zoom_units: float, points: np.ndarray) -> np.ndarray:
+        """Distorted px -> undistorted px of the ideal projection; NaN where none exists."""
+        return self.optics.at(zoom_units).undistort(points)
+
+    def distort(self, zoom_units: float, points: np.ndarray) -> np.ndarray:
+        """Undistorted px -> distorted px; NaN where the distortion has folded over."""
+        return self.optics.at(zoom_units).distort(points)
+
+    def focal_length(self, zoom_units: float) -> float:
+        """px along x; along y it is this times the pixel aspect."""
+        return self.optics.at(zoom_units).focal_length
+
+    def magnification(self, zoom_units: float) -> float:
+        """1 = widest."""
+        return self.optics.magnification(zoom_units)
+
+    def zoom_units(self, magnification: float) -> float:
+        """Inverse of `magnification` over the optical range."""
+        return self.optics.zoom_units(magnification)
+
+    def principal_point(self, zoom_units: float) -> np.ndarray:
+        """(2,) px, undistorted."""
+        return np.array(self.optics.at(zoom_units).principal_point)
+
+    def centre(self, zoom_units: float) -> np.ndarray:
+        """(2,) px: the distortion's centre."""
+        return np.array(self.optics.at(zoom_units).centre)
+
+    def to_json(self, zoom_units: Sequence[float] | None = None) -> dict:
+        """Parameters, and for readers without this package the values at the zooms asked for."""
+        if zoom_units is None:
+            zoom_units = [
+                self.zoom_units(m)
+                for m in TABLE_MAGNIFICATIONS
+                if m <= self.optics.max_magnification
+            ]
+        table = []
+        for units in zoom_units:
+            state = self.optics.at(units)
+            table.append(
+                {
+                    "zoom_units": float(units),
+                    "magnification": self.magnification(units),
+                    "focal_length_px": state.focal_length,
+                    "principal_point_px": list(state.principal_point),
+                    "centre_px": list(state.centre),
+                    "undistorted_to_distorted_abc": list(state.coefficients),
+                    "scale_px": state.scale,
+                }
+            )
+        return {
+            "name": self.name,
+            "seed": self.seed,
+            "optical_zoom_units": OPTICAL_UNITS,
+            "optics": asdict(self.optics),
+            "head": self.head,
+            "ball": self.ball,
+            "table": table,
+        }
+
+    @classmethod
+    def from_json(cls, data: dict) -> CameraTruth:
+        optics = {k: tuple(v) if isinstance(v, list) else v for k, v in data["optics"].items()}
+        missing = {f.name for f in fields(Optics)} ^ set(optics)
+        if missing:
+            raise ValueError(f"optics has too few or too many keys: {sorted(missing)}")
+        head = HeadConfig.model_validate(data["head"]).model_dump(include=set(IMPERFECTIONS))
+        return cls(data["name"], data["seed"], Optics(**optics), head, dict(data["ball"]))
+
+
+@dataclass(frozen=True)
+class TruthComparison:
+    """Largest distance between estimated and true undistortion over the picture, px of the true
+    undistorted picture; inf where the estimate gives no number. The rms after the same alignment
+    stands beside it, as the alignment minimises that."""
+
+    zoom_units: float
+    points: int  # grid points compared, corners included
+    raw_px: float  # as estimated, no alignment
+    similarity_px: float  # after the best turn, scale and shift
+    homography_px: float  # after the best homography
+    similarity_rms_px: float
+    homography_rms_px: float
+    similarity_scale: float  # estimated -> true
+
+
+def write_truth(
+    path: str | Path,
+    cameras: Iterable[SimulatedCamera],
+    zoom_units: Sequence[float] | None = None,
+) -> None:
+    """Writes a truth file (JSON); zoom_units: where its table is evaluated, default 9 zooms."""
+    data = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "cameras": [CameraTruth.of(camera).to_json(zoom_units) for camera in cameras],
+    }
+    Path(path).write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+
+
+def load_truth(path: str | Path) -> dict[str, CameraTruth]:
+    """Reads a truth file: camera name -> truth. Raises SimulationError if it is not one."""
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+        if data["schema"] != SCHEMA or data["version"] != VERSION:
+            raise ValueError(f"schema {data['schema']} version {data['version']}")
+        truths = [CameraTruth.from_json(camera) for camera in data["cameras"]]
+    except OSError as error:
+        raise SimulationError(
+            f"{path}: cannot be read ({error.strerror}); check the path"
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise SimulationError(
+            f"{path}: is not a {SCHEMA} version {VERSION} file ({error}); "
+            "let the simulator write it again"
+        ) from error
+    return {truth.name: truth for truth in truths}
