@@ -7,12 +7,26 @@ if TYPE_CHECKING:
     from torchptz.estimation import Fit, Status, estimate
     from torchptz.lens import RadialLens
     from torchptz.patterns import LinePatterns
-    from torchptz.rectification import rectify
-    from torchptz.zoom_table import ZoomTable
+    from torchptz.rectification import Canvas, canvas_of, rectify
+    from torchptz.zoom_table import Knot, ZoomTable
 
-__all__ = ["Fit", "LinePatterns", "RadialLens", "Status", "ZoomTable", "estimate", "rectify"]
+__all__ = [
+    "Canvas",
+    "Fit",
+    "Knot",
+    "LinePatterns",
+    "RadialLens",
+    "Status",
+    "ZoomTable",
+    "canvas_of",
+    "estimate",
+    "rectify",
+]
 
 _HOMES = {
+    "Canvas": "torchptz.rectification",
+    "Knot": "torchptz.zoom_table",
+    "canvas_of": "torchptz.rectification",
     "Fit": "torchptz.estimation",
     "LinePatterns": "torchptz.patterns",
     "RadialLens": "torchptz.lens",

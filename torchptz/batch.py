@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import fields, replace
 from typing import ClassVar, Self
 
@@ -27,7 +28,8 @@ class Batched:
 
     def __getitem__(self, index: int | slice) -> Self:
         """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``."""
-        if isinstance(index, int):
+        if not isinstance(index, slice):
+            index = operator.index(index)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"item {index} of a batch of {len(self)}")
             index %= len(self)

@@ -9,7 +9,7 @@ import numpy as np
 
 _SIGMA_FLOOR = 0.003  # px: what quantised grey values and sampling leave in a perfect picture
 # Measured on rendered balls (radius 2 to 80 px, noise 0 to 5 DN, JPEG 75 and better, textures):
-_SHADING_SIGMA = 0.03  # px times the radius in px: light from the side, beyond the shading prior
+_SHADING_SIGMA = 0.024  # px times the radius in px: light from the side, beyond the shading prior
 _EDGE_INFLATION = 1.45  # directed light adds more to the first harmonic than to its neighbours
 _SOFTNESS = 0.6  # px: an in-focus edge, PSF of 0.5 px and the pixel's own 0.29 px together
 
@@ -114,11 +114,11 @@ def fit_pixels(
             break
     variance = residual @ residual / max(value.size - 12, 1)
     covariance = variance * np.linalg.inv(normal)
-    shading = _SIGMA_FLOOR + _SHADING_SIGMA / np.exp(p[2])
+    floor = np.hypot(_SIGMA_FLOOR, _SHADING_SIGMA / np.exp(p[2]))
     squeeze = min(np.hypot(p[3], p[4]), 0.9)
     return DiscFit(
         center=np.asarray(center, dtype=np.float64) + p[:2],
-        sigma=float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]) + shading**2)),
+        sigma=float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]) + floor**2)),
         radius=float(np.exp(p[2]) / np.sqrt(1 - squeeze**2)),
         axis_ratio=float((1 + squeeze) / (1 - squeeze)),
         softness=float(np.exp(p[5])),
