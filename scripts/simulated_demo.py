@@ -67,12 +67,8 @@ def main() -> int:
         fleet["defaults"]["zooms"] = [1, 12]
         fleet["defaults"]["scan"] = {"horizontal": 7, "vertical": 6, "points_per_line": 12}
     with serve(simulated, out / "truth.json") as addresses:
-        passwords = {camera.name: camera.password for camera in simulated.cameras}
+        os.environ[PASSWORD_VARIABLE] = simulated.cameras[0].password
         for camera in fleet["cameras"]:
-            # Each simulated camera has a password of its own, found where its entry says.
-            variable = f"{PASSWORD_VARIABLE}_{camera['name'].upper()}"
-            os.environ[variable] = passwords[camera["name"]]
-            camera["credentials"] = {"user": "admin", "password_env": variable}
             camera["address"] = addresses[camera["name"]]
         config = parse_config(fleet, str(CONFIGS / "fleet.yaml"))
         console.print(

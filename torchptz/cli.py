@@ -9,7 +9,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-# What needs torch or OpenCV is imported where it is used: --help should not take seconds.
+# What takes long to load is imported where it is used.
 
 _CONFIG_SUFFIXES = (".yaml", ".yml")
 _EXISTING = click.Path(exists=True, path_type=Path)
@@ -229,7 +231,11 @@ def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
         if ready_file is not None:
             write_whole(ready_file, json.dumps(addresses) + "\n")
 
-    serve(config, truth, announce)
+    stop = threading.Event()
+    # A shell starts what it runs in the background with Ctrl-C ignored, and ends it by SIGTERM.
+    for kind in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(kind, lambda *_: stop.set())
+    serve(config, truth, announce, until=stop)
 
 
 def _print_summary(summary, run: Path) -> None:
@@ -250,9 +256,8 @@ def _print_summary(summary, run: Path) -> None:
             )
         if not camera.zooms:
             table.add_row(name, "", "", "failed", "", "", "", "0")
-    console = Console()
-    # In a file or a pipe there is no terminal whose width would be a reason to cut.
-    console.print(table, width=None if console.is_terminal else 120)
+    # In a file or a pipe there is no terminal whose width would be a reason to break lines.
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
     for name, camera in summary.cameras.items():
         if camera.error is not None:
             click.echo(f"{name}: {_one_line(camera.error)}", err=True)

@@ -88,10 +88,11 @@ class TestStops:
 
     def test_a_still_l_alone_is_not_enough(self):
         problem = small_problem(synthetic.lens())
-        loose = iterate(problem, MIDDLE, tolerance_l=10.0, tolerance_center=1e-6)
-        strict = iterate(problem, MIDDLE, tolerance_l=10.0, tolerance_center=1e3)
-        assert strict.iterations == 1
-        assert loose.iterations > 3
+        by_l = iterate(problem, MIDDLE, tolerance_l=1e-2, tolerance_center=1e3)
+        by_both = iterate(problem, MIDDLE, tolerance_l=1e-2, tolerance_center=1e-6)
+        assert by_l.converged.all()
+        assert by_both.converged.all()
+        assert by_both.iterations > by_l.iterations + 3
 
     def test_a_still_centre_alone_is_not_enough(self):
         problem, known = small_problem(synthetic.lens()), synthetic.lens().center
@@ -128,9 +129,9 @@ class TestItems:
         for i in range(3):
             alone = iterate(problem[i], MIDDLE)
             assert together.iterations[i] == alone.iterations[0]
-            torch.testing.assert_close(together.center[i], alone.center[0], atol=1e-8, rtol=0)
+            torch.testing.assert_close(together.center[i], alone.center[0], atol=1e-6, rtol=0)
             torch.testing.assert_close(
-                together.coefficients[i], alone.coefficients[0], atol=1e-10, rtol=0
+                together.coefficients[i], alone.coefficients[0], atol=1e-9, rtol=0
             )
 
     @pytest.mark.parametrize("bad", [float("nan"), 1e200, "one place", "two places"])
@@ -146,6 +147,6 @@ class TestItems:
             points[0, 3, 4, 1] = bad
         together = iterate(Problem(**{**vars(problem), "points": points}), MIDDLE.expand(2, 2))
         assert together.iterations[1] == alone.iterations[0]
-        torch.testing.assert_close(together.center[1], alone.center[0], atol=1e-8, rtol=0)
+        torch.testing.assert_close(together.center[1], alone.center[0], atol=1e-6, rtol=0)
         assert together.center[0].isfinite().all()
         assert together.coefficients[0].isfinite().all()

@@ -367,3 +367,25 @@ class TestWindowAndArguments:
     def test_unusable_frames(self, frame):
         with pytest.raises(ValueError, match="uint8"):
             detect_ball(frame)
+
+    @pytest.mark.filterwarnings("error")
+    def test_any_picture_gets_an_answer(self, rng):
+        for k in range(120):
+            height, width = rng.integers(4, 120, 2)
+            frame = rng.integers(0, 256, (height, width)).astype(np.uint8)
+            if k % 3 == 1:
+                frame = cv2.GaussianBlur(frame, (0, 0), rng.uniform(1, 4))
+                frame = cv2.normalize(frame, None, 0, 255, cv2.NORM_MINMAX)
+            elif k % 3 == 2:
+                frame = np.zeros_like(frame)
+                for radius in rng.integers(1, 30, 4):
+                    where = (int(rng.integers(width)), int(rng.integers(height)))
+                    cv2.circle(frame, where, int(radius), int(rng.integers(150, 256)), -1)
+            for kwargs in ({}, {"near": (width / 2, height / 2)}, {"expected_radius": 4.0}):
+                seen = detect_ball(frame, **kwargs)
+                if isinstance(seen, Detection):
+                    assert np.isfinite(seen.position).all()
+                    assert seen.sigma > 0
+                    assert 0 <= seen.quality <= 1
+                else:
+                    assert seen.reason

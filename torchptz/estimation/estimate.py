@@ -13,7 +13,7 @@ from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import refine
 from torchptz.estimation.residuals import straightness
-from torchptz.estimation.status import CENTER_SIGMA_LIMIT, Status, center_sigma, judge
+from torchptz.estimation.status import Status, center_unobservable, judge
 from torchptz.estimation.uncertainty import estimate_uncertainty
 from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
@@ -72,6 +72,9 @@ def estimate(
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
     exponents = torch.as_tensor(powers, dtype=torch.float64)
+    rising = exponents.ndim == 1 and len(exponents) > 0 and bool((exponents.diff() > 0).all())
+    if not rising or exponents[0] <= 0:
+        raise ValueError(f"powers must be positive and increasing numbers, not {powers}")
     problem = Problem.from_patterns(patterns, exponents, pixel_aspect)
     start = (problem.image_size - 1) / 2 if center is None else center.to(problem.points)
     start = start.expand_as(problem.image_size)
@@ -82,7 +85,7 @@ def estimate(
 
     solution = solve(hold)
     # Next to no distortion leaves the centre undetermined, and it would drag L along.
-    hold = center_sigma(solution.covariance) > CENTER_SIGMA_LIMIT * problem.scale
+    hold = center_unobservable(solution.coefficients, solution.covariance, problem.scale)
     if hold.any():
         solution = _choose(hold, solve(hold), solution)
     return _as_fit(problem, solution, hold)

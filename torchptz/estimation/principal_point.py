@@ -41,6 +41,7 @@ def estimate_principal_point(tracks: Tensor, mask: Tensor) -> PrincipalPoint:
     Source: paper, sections 1 and 2.
     """
     weight = (mask & (mask.sum(-1, keepdim=True) >= 3)).double()
+    tracks = torch.where(mask.unsqueeze(-1), tracks, 0.0)  # 0 times NaN is NaN
     used = weight.sum(-1) > 0
     lines = fit_lines(tracks, weight)
     distance = lines.distance(tracks)
@@ -98,7 +99,7 @@ def estimate_magnification(
     Source: paper.md, 4.12.
     """
     weight = mask.double()
-    away = (tracks - principal_point[:, None, None]) * weight.unsqueeze(-1)
+    away = torch.where(mask.unsqueeze(-1), tracks - principal_point[:, None, None], 0.0)
     farthest = torch.linalg.vector_norm(away, dim=-1).amax(1)
     level = farthest / farthest.amax(-1, keepdim=True).clamp_min(1e-300)
     for _ in range(_REFITS):

@@ -34,17 +34,17 @@ class Problem(Batched):
     def from_patterns(
         cls, patterns: LinePatterns, powers: Tensor, pixel_aspect: Tensor | float = 1.0
     ) -> Problem:
-        """Weights are 1/sigma² where sigmas are given, else equal."""
+        """In float64, whatever the patterns are in. Weights are 1/sigma² where sigmas are given."""
         weight = patterns.mask.double()
         if patterns.sigma is not None:
-            weight = weight / patterns.sigma**2
+            weight = weight / patterns.sigma.double() ** 2
             mean = weight.sum((1, 2), keepdim=True) / patterns.mask.sum((1, 2), keepdim=True)
             weight = weight / mean
-        size = patterns.image_size
+        size, offsets = patterns.image_size.double(), patterns.offsets
         return cls(
-            points=patterns.points,
+            points=patterns.points.double(),
             weight=weight,
-            offsets=patterns.offsets,
+            offsets=None if offsets is None else offsets.double(),
             image_size=size,
             scale=size[:, 0] / 2,
             pixel_aspect=torch.as_tensor(pixel_aspect, dtype=size.dtype, device=size.device).expand(

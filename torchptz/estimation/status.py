@@ -12,6 +12,9 @@ from torchptz.lens import RadialLens
 
 # A centre known no better than this part of the half width is not known.
 CENTER_SIGMA_LIMIT = 0.25
+# l' C^-1 l per coefficient, below which L cannot be told from 1: the centre then follows the noise,
+# much farther than its linearised covariance says.
+SEEN_LIMIT = 10.0
 # A correction at the image's farthest corner known no better than this, in px, is not known.
 CORNER_SIGMA_LIMIT_PX = 5.0
 
@@ -48,6 +51,23 @@ def center_sigma(covariance: Tensor) -> Tensor:
     safe = torch.where(known[:, None, None], block, 0.0)
     largest = torch.linalg.eigvalsh(safe)[:, -1].clamp_min(0).sqrt()
     return torch.where(known, largest, torch.inf)
+
+
+def center_unobservable(coefficients: Tensor, covariance: Tensor, scale: Tensor) -> Tensor:
+    """(B,) bool: the centre is known too badly, or there is no distortion to have one.
+
+    Args:
+        coefficients: (B, K).
+        covariance: (B, M, M) with centre and coefficients free.
+        scale: (B,) px.
+    """
+    count = coefficients.shape[1]
+    block = covariance[:, 2 : 2 + count, 2 : 2 + count]
+    known = block.isfinite().all((1, 2)) & coefficients.isfinite().all(1)
+    safe = torch.where(known[:, None, None], block, torch.eye(count).to(block))
+    solved = torch.linalg.solve_ex(safe, coefficients.unsqueeze(-1)).result.squeeze(-1)
+    seen = known & ((coefficients * solved).sum(-1) > SEEN_LIMIT * count)
+    return ~seen | (center_sigma(covariance) > CENTER_SIGMA_LIMIT * scale)
 
 
 def corner_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:

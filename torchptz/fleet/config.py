@@ -106,6 +106,14 @@ class CameraConfig(Section):
             raise ValueError(str(error).removeprefix(f"camera {name}: ")) from None
         return value
 
+    @field_validator("pan_sign", "tilt_sign", mode="before")
+    @classmethod
+    def _no_truth_value(cls, value: object) -> object:
+        # Python takes True for 1, and YAML takes yes for True.
+        if isinstance(value, bool):
+            raise ValueError(f"must be 1 or -1, not {value}")
+        return value
+
     @field_validator("zooms")
     @classmethod
     def _ascending(cls, value: list[float]) -> list[float]:

@@ -35,10 +35,10 @@ def collect(
         for camera in config.cameras
     }
     with ThreadPoolExecutor(max_workers=len(collectors)) as workers:
-        running = {name: workers.submit(one.run) for name, one in collectors.items()}
         try:
+            running = {name: workers.submit(one.run) for name, one in collectors.items()}
             wait(running.values())
-        except KeyboardInterrupt:
+        except BaseException:  # the interrupt, or what the handler of another signal raises
             # Leaving the with block waits for the workers, which put their heads back first.
             stop.set()
             raise

@@ -48,7 +48,8 @@ def read_journal(path: Path) -> Iterator[Observation]:
     Raises:
         ValueError: a line that is no observation; names the file and the line.
     """
-    lines = path.read_text(encoding="utf-8").splitlines()
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
     for number, line in enumerate(lines, 1):
         try:
             stored = json.loads(line)
@@ -58,7 +59,7 @@ def read_journal(path: Path) -> Iterator[Observation]:
                 stored["pixel"] = tuple(stored["pixel"])
             observation = Observation(**stored)
         except (ValueError, TypeError, KeyError) as error:
-            if number == len(lines):
+            if number == len(lines) and not text.endswith("\n"):
                 return
             raise ValueError(f"{path}, line {number}: not an observation ({error})") from error
         yield observation

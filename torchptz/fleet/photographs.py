@@ -176,7 +176,7 @@ def _read_line_set(path: Path) -> tuple[list[np.ndarray], np.ndarray, tuple[str,
             arrays = {key: stored[key] for key in stored.files}
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file") from None
-    except (*_NO_ARRAYS, AttributeError) as error:  # a lone array has no files
+    except (*_NO_ARRAYS, TypeError) as error:  # a lone array is no archive
         raise ValueError(f"{path}: not a set of lines ({error})") from error
     missing = [key for key in ("xy", "line", "size") if key not in arrays]
     if missing:

@@ -162,7 +162,7 @@ def _targets(inputs: list[Path], out: Path) -> list[Path]:
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file; give a folder to write to")
     sources: dict[Path, Path] = {}
-    taken = {path.resolve() for path in inputs}
+    originals = {_identity(path) for path in inputs if path.exists()}
     for path in inputs:
         target = out / path.name
         if target in sources:
@@ -170,7 +170,7 @@ def _targets(inputs: list[Path], out: Path) -> list[Path]:
                 f"{path} and {sources[target]} would both be written to {target}: rectify them "
                 "into different folders"
             )
-        if target.resolve() in taken or any(_same_file(target, one) for one in inputs):
+        if target.exists() and _identity(target) in originals:
             raise ValueError(
                 f"{target} would overwrite a picture that is to be rectified: give another folder"
             )
@@ -178,8 +178,10 @@ def _targets(inputs: list[Path], out: Path) -> list[Path]:
     return list(sources)
 
 
-def _same_file(target: Path, path: Path) -> bool:
-    return target.exists() and path.exists() and target.samefile(path)
+def _identity(path: Path) -> tuple[int, int]:
+    """The same for all names and links of one file."""
+    found = path.stat()
+    return found.st_dev, found.st_ino
 
 
 def _decode(data: bytes, flags: int) -> np.ndarray | None:

@@ -101,17 +101,16 @@ def _find(
 ) -> Observation:
     """The feature in one of the views around a direction, nearest first."""
     can = observer.camera.capabilities
-    reasons = []
+    reasons, visited = [], set()
     for right, down in _spiral(_SEARCH_RINGS):
         pan = direction[0] - right * _SEARCH_STEP * fov
         tilt = direction[1] + down * _SEARCH_STEP * fov * shape
-        inside = (
-            can.pan_limits[0] <= pan <= can.pan_limits[1]
-            and can.tilt_limits[0] <= tilt <= can.tilt_limits[1]
-        )
-        if not inside:
-            continue
         pose = Pose(*can.nearest_reachable(pan, tilt), widest)
+        # What lies beyond a limit is looked at from the limit, where that shows any of it.
+        beyond = abs(pose.pan - pan) > fov / 2 or abs(pose.tilt - tilt) > fov * shape / 2
+        if beyond or pose in visited:
+            continue
+        visited.add(pose)
         seen = observer.look(pose, "locate")
         if seen.found:
             return seen

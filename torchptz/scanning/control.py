@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchptz.geometry import head_rotation, pan_tilt_to_see, project, to_camera
+from torchptz.geometry import head_rotation, pan_tilt_to_see, project, to_camera, wrap_angle
 
 _NEWTON_STEPS = 8
 _TOLERANCE = 1e-12  # rad
@@ -18,7 +18,7 @@ _TOLERANCE = 1e-12  # rad
 class Scan:
     """Poses of N scans of up to S steps."""
 
-    pan: Tensor  # (N, S) rad
+    pan: Tensor  # (N, S) rad, in [-pi, pi]
     tilt: Tensor  # (N, S) rad
     mask: Tensor  # (N, S) bool, False behind the end of a scan
 
@@ -65,7 +65,7 @@ def scan_lines(
     step = _path_length(planes, rays, first, last, start, end) / (steps - 1)
     # The direction in which the path leaves its start: along the plane, towards the end.
     along = _tangent(planes, rays, first)
-    along = along * torch.sign((along * (last - first)).sum(-1, keepdim=True))
+    along = along * torch.sign((along * _difference(last, first)).sum(-1, keepdim=True))
     poses, previous = [first], first - along * step[:, None]
     for _ in range(steps - 1):
         now = poses[-1]
@@ -74,7 +74,7 @@ def scan_lines(
         previous = now
         poses.append(_solve_step(planes, rays, now, now + ahead, step))
     path = torch.stack(poses, 1)
-    pan, tilt = path.unbind(-1)
+    pan, tilt = wrap_angle(path[..., 0]), path[..., 1]
     reachable = (pan >= pan_limits[0]) & (pan <= pan_limits[1])
     reachable &= (tilt >= tilt_limits[0]) & (tilt <= tilt_limits[1])
     return Scan(pan, tilt, reachable & path.isfinite().all(-1))
@@ -147,4 +147,10 @@ def _path_length(
     between = start[:, None] + share * (end - start)[:, None]
     path = _pose(rays[:, None].expand(*between.shape[:2], 3), between)
     path = torch.cat([first[:, None], path[:, 1:-1], last[:, None]], 1)
-    return torch.linalg.vector_norm(path.diff(dim=1), dim=-1).sum(-1)
+    return torch.linalg.vector_norm(_difference(path[:, 1:], path[:, :-1]), dim=-1).sum(-1)
+
+
+def _difference(pose: Tensor, other: Tensor) -> Tensor:
+    """(..., 2) rad from another pose, pans on the circle."""
+    pan, tilt = (pose - other).unbind(-1)
+    return torch.stack([wrap_angle(pan), tilt], -1)

@@ -55,6 +55,8 @@ def detect_ball(
     if near is not None and search_radius is None:
         search_radius = max(24.0, 3.0 * (expected_radius or 0.0))
     x0, y0, x1, y1 = _window(frame.shape, near, search_radius, expected_radius)
+    if min(frame.shape[:2]) < 8:
+        return NotFound(f"an image of {frame.shape[1]} x {frame.shape[0]} px is too small")
     if x1 - x0 < 8 or y1 - y0 < 8:
         return NotFound(f"the search window around {_where(near)} lies outside the image")
     crop = frame[y0:y1, x0:x1]
@@ -173,7 +175,10 @@ def _measure(view: _View, box, expected_radius: float | None) -> Detection | str
     border = _border_distance(view, center)
     if border < radius + _CLEAR:
         return "is cut by the image border"
-    fit = (fit_pixels if radius < _EDGE_FIT_FROM else fit_edge)(gray, center, radius)
+    try:
+        fit = (fit_pixels if radius < _EDGE_FIT_FROM else fit_edge)(gray, center, radius)
+    except np.linalg.LinAlgError:
+        return _NO_DISC
     return _judge(view, fit, center, radius, expected_radius)
 
 
@@ -242,7 +247,7 @@ def _outline(gray: np.ndarray, box) -> tuple[np.ndarray, float, float] | str:
     area = moments["m00"]
     center = np.array([moments["m10"], moments["m01"]]) / area
     # the pixels' own extent and the blur would hide the elongation of a tiny blob
-    xx, yy = moments["mu20"] / area - 0.2, moments["mu02"] / area - 0.2
+    xx, yy = (max(moments[name] / area - 0.2, 0.05) for name in ("mu20", "mu02"))
     spread = np.hypot(xx - yy, 2 * moments["mu11"] / area)
     ratio = np.sqrt((xx + yy + spread) / max(xx + yy - spread, 1e-3))
     radius = float(np.sqrt(area / np.pi))

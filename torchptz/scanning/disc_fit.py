@@ -57,7 +57,8 @@ def fit_pixels(
     """Fit a soft ellipse with shading on a sloping background to every pixel around it.
 
     gray (H, W) uint8; center (2,) and radius: first guess in px. Right for small balls, where
-    each pixel is an edge pixel and the background is little more than a slope.
+    each pixel is an edge pixel and the background is little more than a slope. Raises
+    numpy.linalg.LinAlgError where the pixels look so little like a disc that nothing is fixed.
     """
     reach = radius + 2.5
     x0, y0 = (max(0, int(np.floor(v - reach))) for v in center)
@@ -109,7 +110,10 @@ def fit_pixels(
         # the shape may not run away while the levels are still wrong
         step[:6] = np.clip(step[:6], -0.5, 0.5)
         p = p + step
+        p[:2] = np.clip(p[:2], -reach, reach)
+        p[2] = np.clip(p[2], np.log(0.5), np.log(3 * reach))
         p[3:5] = np.clip(p[3:5], -0.5, 0.5)
+        p[5] = np.clip(p[5], np.log(0.25), np.log(4.0))
         if np.abs(step[:6]).max() < 1e-3:
             break
     variance = residual @ residual / max(value.size - 12, 1)
@@ -133,7 +137,8 @@ def fit_edge(
     """Fit an ellipse robustly to edge points found on rays, each with its own grey levels.
 
     gray (H, W) uint8; center (2,) and radius: first guess in px, good to about 2 px. Right for
-    large balls: neither the shading nor the texture behind the ball has to be modelled.
+    large balls: neither the shading nor the texture behind the ball has to be modelled. Raises
+    numpy.linalg.LinAlgError where there is no edge.
     """
     count = int(np.clip(round(2 * np.pi * radius), 32, 320))
     angle = np.arange(count) * (2 * np.pi / count)

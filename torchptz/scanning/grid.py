@@ -8,6 +8,7 @@ from torch import Tensor
 from torchptz.geometry import project, to_camera
 
 _REACH = 2  # grid steps to either side of the asked pose
+_EVENNESS = 1e-6  # of the way along a line, against the way across it
 
 
 def reachable_near(
@@ -54,7 +55,8 @@ def reachable_near(
     allowed = along <= spacing[..., None] / 2
     # The nearest grid pose is always allowed: where the grid is coarser than the step, no other is.
     allowed |= (moves == 0).all(-1)
-    best = torch.where(allowed, across, torch.inf).argmin(-1, keepdim=True)
+    # Along rows of the grid all are equally far across: the nearest of these.
+    best = torch.where(allowed, across + _EVENNESS * along, torch.inf).argmin(-1, keepdim=True)
     return candidate_pan.gather(-1, best).squeeze(-1), candidate_tilt.gather(-1, best).squeeze(-1)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-_OUTERMOST = 0.7  # of the overscan, where the outermost lines are
+_OUTERMOST = 0.5  # of the overscan, where the outermost lines are
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def _parallel(
     extent = corners @ normal
     axis_parallel = min(abs(direction[0]), abs(direction[1])) < 1e-9
     if axis_parallel:  # the outermost lines run along the box's edges
-        shares = torch.linspace(0, 1, count, dtype=torch.float64) if count > 1 else [0.5]
+        shares = torch.linspace(0, 1, count, dtype=torch.float64) if count > 1 else [0.5] * count
     else:  # oblique ones shrink to nothing at the corners: keep off these
         shares = (torch.arange(count, dtype=torch.float64) + 1) / (count + 1)
     lines = []

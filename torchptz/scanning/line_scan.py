@@ -95,16 +95,18 @@ def plan_lines(
     Source: paper, section 1; grid after paper.md, 4.10.
     """
     pp = torch.from_numpy(view.principal_point)
+    focal = view.focal_lengths
+    # The head's rounding must not push the feature over the border either.
+    rounding = float(focal.max()) * max(can.pan_quantum, can.tilt_quantum) / 2
     lines = spread_lines(
         view.image_size,
         tuple(view.principal_point),
         horizontal,
         vertical,
         oblique,
-        view.margin,
+        view.margin + rounding,
         overscan,
     )
-    focal = view.focal_lengths
     planes = line_plane(lines.line, focal, pp)
     scan = scan_lines(
         planes,

@@ -15,15 +15,22 @@ from torchptz.scanning.detection import Detection, NotFound, detect_ball
 from torchptz.scanning.stillness import pictures_still
 
 _MOST_PICTURES = 12  # per look; a picture that moves for longer will not come to rest
+_MOST_RETURNS = 3  # per look, after somebody else moved the head
 _STILL_PX = 0.5  # the feature's largest move between two pictures of a head at rest
-# A head that has not arrived and does not move any more is given this long to start.
+# A head that has not arrived and whose readings do not change is given this long to (re)start.
 _PATIENCE_S = 2.0
-_ARRIVAL_QUANTA = 1.5
+_THERE_QUANTA = 0.6
+# A head that stops beside its target is at rest if it stays; until then it may be creeping there.
+_BESIDE_QUANTA = 1.5
+_BESIDE_S = 0.3
 _ZOOM_ARRIVAL = 0.003  # of the zoom range
 
 
 class Stopped(Exception):
     """The run was asked to stop."""
+
+    def __init__(self) -> None:
+        super().__init__("stopped before it was finished")
 
 
 @dataclass(frozen=True)
@@ -87,21 +94,27 @@ class Observer:
         Raises:
             MotionError: it did not move, stopped elsewhere or never came to rest.
         """
-        started = time.monotonic()
+        if self._stop.is_set():
+            raise Stopped
         self.camera.move(pose)
+        # Time counts from here: a camera that is slow to reply has not begun to move before.
+        started = changed = time.monotonic()
         first = previous = None
         while True:
             if self._stop.is_set():
                 raise Stopped
             reading = self.camera.position()
             first = first or reading
-            waited = time.monotonic() - started
-            if previous is not None and self._same(reading, previous):
-                if self._arrived(reading, pose):
-                    return reading
-                if waited > min(_PATIENCE_S, self._timeout):
-                    raise MotionError(self._not_there(pose, reading, moved=reading != first))
-            if waited > self._timeout:
+            now = time.monotonic()
+            if previous is None or not self._same(reading, previous):
+                changed = now
+            elif self._arrived(reading, pose, now - changed):
+                return reading
+            late = previous is not None and now - started > self._timeout
+            # Two equal readings alone show nothing: a slow head's are whole quanta.
+            if now - changed > (min(_PATIENCE_S, self._timeout / 2) if late else _PATIENCE_S):
+                raise MotionError(self._not_there(pose, reading, moved=reading != first))
+            if late:
                 raise MotionError(
                     f"{self._name}: the head was still moving {self._timeout:g} s after a move; "
                     "is a tour or another user driving it? (timing.settle_timeout_s)"
@@ -133,7 +146,7 @@ class Observer:
         Raises:
             MotionError: the head or the picture does not come to rest.
         """
-        before = self.go(pose)
+        before, returns = self.go(pose), 0
         last: tuple[np.ndarray, Detection | NotFound] | None = None
         for _ in range(_MOST_PICTURES):
             if self._stop.is_set():
@@ -150,7 +163,14 @@ class Observer:
                 return self._observation(
                     pose, before, after, last[1], seen, purpose, zoom_index, group
                 )
-            before, last = after, None  # somebody moved it between the pictures: begin again
+            # Somebody moved it between the pictures: begin again.
+            returns += 1
+            if returns > _MOST_RETURNS:
+                raise MotionError(
+                    f"{self._name}: the head was moved {returns} times while it should be at "
+                    "rest; is a tour, a tracker or another user driving it?"
+                )
+            before, last = self.go(pose), None
         raise MotionError(
             f"{self._name}: the picture did not come to rest in {_MOST_PICTURES} pictures; is the "
             "feature swinging, the mast shaking, or the image stabiliser on?"
@@ -209,13 +229,15 @@ class Observer:
             and a.zoom == b.zoom
         )
 
-    def _arrived(self, reading: Pose, pose: Pose) -> bool:
+    def _arrived(self, reading: Pose, pose: Pose, unchanged_s: float) -> bool:
+        """Whether a reading is near enough to a pose, after it did not change for a time."""
+        quanta = _BESIDE_QUANTA if unchanged_s > _BESIDE_S else _THERE_QUANTA
         can = self.camera.capabilities
         pan = abs(math.remainder(reading.pan - pose.pan, 2 * math.pi))
         zoom_range = can.zoom_limits[1] - can.zoom_limits[0]
         return (
-            pan <= _ARRIVAL_QUANTA * max(can.pan_quantum, 1e-4)
-            and abs(reading.tilt - pose.tilt) <= _ARRIVAL_QUANTA * max(can.tilt_quantum, 1e-4)
+            pan <= quanta * max(can.pan_quantum, 1e-4)
+            and abs(reading.tilt - pose.tilt) <= quanta * max(can.tilt_quantum, 1e-4)
             and abs(reading.zoom - pose.zoom) <= _ZOOM_ARRIVAL * zoom_range
         )
 

@@ -14,6 +14,7 @@ from torchptz.scanning.observation import Observation, Observer
 
 _LEVELS = 7  # at least, spread evenly over the log of magnification
 _CLEARANCE = 6  # px between the feature's rim and the picture's border
+_PINCUSHION = 0.02  # of the distance from the middle: the most that a long zoom pushes outwards
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,10 @@ def scan_tracks(
     """
     camera = observer.camera
     middle = (np.asarray(image_size, dtype=float) - 1) / 2
-    reach = middle - radius - _CLEARANCE
+    # The pose is rounded to the head's grid, which moves the feature by up to half a quantum.
+    quanta = np.array([camera.capabilities.pan_quantum, camera.capabilities.tilt_quantum])
+    rounding = focal_length * np.array([1, pixel_aspect]) * quanta / 2
+    reach = (middle - radius - _CLEARANCE - rounding) / (1 + _PINCUSHION)
     longest = levels[-1]
     points = np.full((count, len(levels), 2), np.nan)
     sigma = np.full((count, len(levels)), np.nan)

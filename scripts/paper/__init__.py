@@ -1,0 +1,1 @@
+"""The two experiments of the paper, section 3."""

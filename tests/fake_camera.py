@@ -1,0 +1,128 @@
+"""A camera in memory: a pinhole with a lens on a quantised head, and an observer of its ball."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchptz.cameras import Capabilities, Pose
+from torchptz.geometry import project, to_camera
+from torchptz.lens import RadialLens
+from torchptz.scanning.observation import Observation
+
+QUANTUM = (math.radians(1 / 14.4), math.radians(1 / 15.652))
+
+
+def capabilities(**changed) -> Capabilities:
+    given = {
+        "pan_limits": (-2.9, 2.9),
+        "tilt_limits": (-0.5, 1.5),
+        "pan_quantum": QUANTUM[0],
+        "tilt_quantum": QUANTUM[1],
+        "pan_origin": 0.0,
+        "tilt_origin": 0.001,
+        "zoom_limits": (0.0, 1000.0),
+        "max_magnification": 10.0,
+        "horizontal_fov": None,
+        "reads_position": True,
+        "reports_motion": False,
+    }
+    return Capabilities(**{**given, **changed})
+
+
+@dataclass
+class FakeCamera:
+    """Its zoom units are 1000 log10 of the magnification; it is where it was sent at once."""
+
+    ray: Tensor  # (3,) of the ball
+    lens: RadialLens  # batch of one, at every zoom
+    principal_point: np.ndarray  # (2,) px
+    focal_length: float  # px at the widest zoom, along x
+    capabilities: Capabilities = field(default_factory=capabilities)
+    name: str = "fake"
+    pose: Pose = field(default_factory=lambda: Pose(0.0, 0.0, 0.0))
+
+    def move(self, pose: Pose) -> None:
+        self.pose = Pose(*self.capabilities.nearest_reachable(pose.pan, pose.tilt), pose.zoom)
+
+    def position(self) -> Pose:
+        return self.pose
+
+    def snapshot(self) -> np.ndarray:
+        return np.zeros((*self.lens.image_size[0].int().tolist()[::-1], 3), np.uint8)
+
+    def prepare(self) -> None:
+        """Nothing to prepare."""
+
+    def restore(self) -> None:
+        """Nothing was changed."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def zoom_units(self, magnification: float) -> float:
+        return 1000 * math.log10(magnification)
+
+    def magnification(self, zoom_units: float) -> float:
+        return 10 ** (zoom_units / 1000)
+
+    def ball(self, pose: Pose) -> np.ndarray:
+        """(2,) px of the ball, NaN where the lens or the head cannot see it."""
+        angles = torch.tensor([pose.pan, pose.tilt], dtype=torch.float64)
+        image = project(to_camera(self.ray, *angles)).numpy()
+        focal = self.focal_length * self.magnification(pose.zoom)
+        focal = focal * np.array([1.0, float(self.lens.pixel_aspect[0])])
+        ideal = torch.from_numpy(self.principal_point + focal * image)
+        return self.lens.distort(ideal[None, None])[0, 0].numpy()
+
+
+@dataclass
+class FakeObserver:
+    """Looks without pictures: finds the ball wherever it is whole and inside the search circle.
+
+    ``blind`` says which looks, counted from 0, find nothing; ``slip`` is added to the pose of the
+    head (pan, tilt, rad) in what it shows and reads.
+    """
+
+    camera: FakeCamera
+    radius: float = 8.0
+    blind: Callable[[int], bool] = lambda number: False
+    slip: Callable[[int], tuple[float, float]] = lambda number: (0.0, 0.0)
+    looks: list[Observation] = field(default_factory=list)
+    searches: list[tuple[np.ndarray, float]] = field(default_factory=list)
+
+    def look(
+        self, pose, purpose, *, zoom_index=-1, group=0, near, search_radius, expected_radius
+    ) -> Observation:
+        number = len(self.looks)
+        self.camera.move(pose)
+        pan, tilt = self.slip(number)
+        at = self.camera.position()
+        at = Pose(at.pan + pan, at.tilt + tilt, at.zoom)
+        seen = self.camera.ball(at)
+        size = self.camera.lens.image_size[0].numpy()
+        whole = ((seen > self.radius - 0.5) & (seen < size - 0.5 - self.radius)).all()
+        near_enough = np.linalg.norm(seen - near) <= search_radius
+        found = bool(whole and near_enough and not self.blind(number))
+        self.searches.append((np.asarray(near), search_radius))
+        self.looks.append(
+            Observation(
+                purpose=purpose,
+                zoom_index=zoom_index,
+                group=group,
+                commanded=pose,
+                read_before=at,
+                read_after=at,
+                pixel=tuple(seen.tolist()) if found else None,
+                sigma=0.05 if found else None,
+                radius=expected_radius if found else None,
+                quality=1.0 if found else None,
+                reason=None if found else "not there",
+                rest_rule="in memory",
+                taken_at=0.0,
+            )
+        )
+        return self.looks[-1]

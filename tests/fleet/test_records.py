@@ -1,0 +1,94 @@
+"""CameraRecord and the files of a run's folder."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns, write_whole
+from torchptz.patterns import LinePatterns
+
+
+def record() -> CameraRecord:
+    return CameraRecord(
+        name="gate",
+        image_size=(736, 544),
+        principal_point=[366.0, 270.5],
+        principal_point_covariance=[[0.1, 0.0], [0.0, 0.2]],
+        ray=[0.0, 0.6, 0.8],
+        ray_sigma=1e-4,
+        feature={"kind": "ball"},
+        zooms=[ZoomRecord(zoom_units=5638.0, magnification=2.1, lines=3, points=60)],
+    )
+
+
+class TestFile:
+    def test_a_record_comes_back_as_it_was(self, tmp_path):
+        record().save(tmp_path)
+        assert CameraRecord.load(tmp_path) == record()
+
+    def test_it_names_its_schema(self, tmp_path):
+        record().save(tmp_path)
+        stored = json.loads((tmp_path / "camera.json").read_text())
+        assert (stored["schema"], stored["version"]) == ("torchptz.camera_record", 1)
+
+    @pytest.mark.parametrize(
+        ("change", "word"),
+        [
+            ({"schema": "other"}, "schema"),
+            ({"version": 2}, "version is 2"),
+            ({"name": None}, "name"),
+            ({"surprise": 1}, "surprise"),
+            ({"zooms": [{"magnification": "x"}]}, "zooms.0.magnification"),
+        ],
+    )
+    def test_another_file_is_refused_by_name_and_field(self, tmp_path, change, word):
+        record().save(tmp_path)
+        stored = json.loads((tmp_path / "camera.json").read_text())
+        (tmp_path / "camera.json").write_text(json.dumps(stored | change))
+        with pytest.raises(ValueError, match=rf"camera.json: .*{word}"):
+            CameraRecord.load(tmp_path)
+
+    @pytest.mark.parametrize("content", ["", "{", "[]", "3"])
+    def test_what_is_no_record(self, tmp_path, content):
+        (tmp_path / "camera.json").write_text(content)
+        with pytest.raises(ValueError, match=r"camera.json: not a camera's record"):
+            CameraRecord.load(tmp_path)
+
+    def test_a_failed_write_leaves_the_old_file(self, tmp_path, monkeypatch):
+        path = tmp_path / "file.json"
+        write_whole(path, "old")
+        with pytest.raises(UnicodeEncodeError):
+            write_whole(path, "new \ud800")
+        assert path.read_text() == "old"
+
+
+class TestValues:
+    @pytest.mark.parametrize("unknown", [math.nan, math.inf])
+    def test_a_sigma_that_is_not_known_is_none(self, unknown):
+        assert (
+            ZoomRecord(magnification=1.0, magnification_sigma=unknown).magnification_sigma is None
+        )
+
+    @pytest.mark.parametrize("magnification", [math.nan, 0.0, -1.0])
+    def test_refuses_what_is_no_magnification(self, magnification):
+        with pytest.raises(ValueError, match="magnification"):
+            ZoomRecord(magnification=magnification)
+
+    def test_checks_what_is_assigned(self):
+        with pytest.raises(ValueError, match="image_size"):
+            record().image_size = (3, "x")
+
+    @pytest.mark.parametrize("path", ["../other/zoom.npz", "/etc/passwd", "a\\b", ""])
+    def test_patterns_stay_in_the_camera_s_folder(self, path):
+        with pytest.raises(ValueError, match="patterns"):
+            ZoomRecord(magnification=1.0, patterns=path)
+
+    def test_patterns_lie_where_the_record_says(self, tmp_path):
+        line = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+        name = save_patterns(tmp_path, 3, LinePatterns.from_lists([[line]], (10, 10)))
+        zoom = ZoomRecord(magnification=1.0, patterns=name)
+        loaded = LinePatterns.load(tmp_path / zoom.patterns)
+        assert np.array_equal(loaded.to_lists()[0][0], line)
+        assert [path.name for path in (tmp_path / "patterns").iterdir()] == ["zoom_03.npz"]

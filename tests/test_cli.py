@@ -1,0 +1,309 @@
+"""The command line: help, one line for what goes wrong, exit codes, and a small run."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from tests import synthetic
+from torchptz.cli import main
+from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
+from torchptz.fleet.solve import solve
+from torchptz.rectification import rectify
+from torchptz.zoom_table import ZoomTable
+
+COMMANDS = ["collect", "solve", "calibrate", "rectify", "simulate"]
+LENS = synthetic.lens()
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(one) for one in arguments])
+
+
+def failed(*arguments, code=2) -> str:
+    """stderr of a command that must fail, in one line unless click explains the usage."""
+    result = run(*arguments)
+    assert result.exit_code == code, result.output
+    assert isinstance(result.exception, SystemExit)  # and no traceback
+    return result.stderr
+
+
+@pytest.fixture
+def line_set(tmp_path):
+    lines = synthetic.pattern_of(LENS).to_lists()[0]
+    path = tmp_path / "harp.npz"
+    np.savez(
+        path,
+        xy=np.concatenate(lines),
+        line=np.repeat(np.arange(len(lines)), [len(line) for line in lines]),
+        size=np.array(synthetic.PAPER_SIZE),
+    )
+    return path
+
+
+@pytest.fixture
+def config(tmp_path):
+    """A fleet of cameras that nobody serves."""
+
+    def write(*cameras, **defaults):
+        path = tmp_path / "fleet.yaml"
+        path.write_text(yaml.safe_dump({"defaults": defaults, "cameras": list(cameras)}))
+        return path
+
+    return write
+
+
+class TestHelp:
+    @pytest.mark.parametrize("command", COMMANDS)
+    def test_of_every_command(self, command):
+        result = run(command, "--help")
+        assert result.exit_code == 0
+        assert result.output.startswith(f"Usage: main {command}")
+
+    def test_names_every_command_and_the_exit_codes(self):
+        output = run("--help").output
+        for word in [*COMMANDS, "Exit codes"]:
+            assert word in output
+
+    def test_version(self):
+        result = run("--version")
+        assert result.exit_code == 0
+        assert result.output.strip().endswith("0.1.0")
+
+
+class TestSmallRun:
+    def test_from_measured_lines_to_rectified_pictures(self, line_set, tmp_path):
+        out = tmp_path / "run"
+        result = run("collect", line_set, "--out", out, "--name", "gate")
+        assert result.exit_code == 0
+        assert "14 lines, 490 points" in result.output
+
+        result = run("solve", out, "--powers", "1,2,3")
+        assert result.exit_code == 0
+        assert "gate" in result.output
+        assert "ok" in result.output
+        table = out / "gate" / "table.json"
+        lens = ZoomTable.load(table).at(1.0)
+        error = synthetic.largest_error(lens, synthetic.truth_of(LENS), similarity=True)
+        assert error < 0.01
+
+        before = np.zeros((480, 640, 3), np.uint8)
+        before[::20], before[:, ::20] = 255, 255
+        (tmp_path / "in").mkdir()
+        cv2.imwrite(str(tmp_path / "in" / "view.png"), before)
+        result = run("rectify", table, tmp_path / "in", "-o", tmp_path / "flat")
+        assert result.exit_code == 0
+        assert "1 pictures rectified" in result.output
+        after = cv2.imread(str(tmp_path / "flat" / "view.png"))
+        assert np.array_equal(after, rectify(before, lens))
+        assert not np.array_equal(after, before)
+
+    def test_powers_reach_the_lens(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        assert run("solve", tmp_path / "run", "--powers", "2,4").exit_code == 0
+        assert ZoomTable.load(tmp_path / "run/harp/table.json").lens.powers.tolist() == [2, 4]
+
+    def test_without_offsets_goes_to_another_table(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        assert run("solve", tmp_path / "run", "--without-offsets").exit_code == 0
+        folder = tmp_path / "run" / "harp"
+        assert (folder / "table_without_offsets.json").exists()
+        assert not (folder / "table.json").exists()
+
+
+class TestPartlyFailed:
+    """Exit code 1: some is there, and the rest is named."""
+
+    def test_solve(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        (tmp_path / "run" / "bad").mkdir()
+        CameraRecord(name="bad", error="camera bad: switched off").save(tmp_path / "run" / "bad")
+        assert "bad: camera bad: switched off" in failed("solve", tmp_path / "run", code=1)
+
+    def test_solve_where_nothing_succeeded(self, tmp_path):
+        (tmp_path / "bad").mkdir()
+        CameraRecord(name="bad", error="camera bad: switched off").save(tmp_path / "bad")
+        assert "switched off" in failed("solve", tmp_path, code=2)
+
+    def test_rectify(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        solve(tmp_path / "run")
+        pictures = tmp_path / "in"
+        pictures.mkdir()
+        cv2.imwrite(str(pictures / "good.png"), np.zeros((480, 640), np.uint8))
+        (pictures / "broken.png").write_bytes(b"no picture")
+        cv2.imwrite(str(pictures / "small.png"), np.zeros((240, 320), np.uint8))
+        table = tmp_path / "run/harp/table.json"
+        text = failed("rectify", table, pictures, "-o", tmp_path / "out", code=1)
+        assert "broken.png: is no picture" in text
+        assert "small.png: the images are 320x240 px" in text
+        assert (tmp_path / "out" / "good.png").exists()
+        (pictures / "good.png").unlink()
+        failed("rectify", table, pictures, "-o", tmp_path / "out", code=2)
+
+
+class TestWrongInput:
+    """Exit code 2 and one line that says what to do."""
+
+    def one_line(self, *arguments) -> str:
+        text = failed(*arguments)
+        assert text.startswith("torchptz: ")
+        assert text.count("\n") == 1
+        return text
+
+    @pytest.mark.parametrize("command", ["collect", "calibrate"])
+    def test_a_typo_in_the_configuration(self, config, tmp_path, command):
+        camera = {"name": "a", "address": "a", "feature": {"tilt_degg": 1}}
+        path = config(camera, dialect="sony_rz30", zooms=[1])
+        text = self.one_line(command, path, "--out", tmp_path / "run")
+        assert "fleet.yaml: cameras[0].feature.tilt_degg" in text
+        assert "did you mean tilt_deg?" in text
+        assert not (tmp_path / "run").exists()
+
+    def test_a_simulation_s_configuration_in_place_of_a_fleet_s(self, config, tmp_path):
+        path = config({"name": "a", "port": 8471, "password": "north-secret"})
+        text = self.one_line("calibrate", path, "--out", tmp_path / "run")
+        assert "cameras[0].port" in text
+        assert "north-secret" not in text
+
+    @pytest.mark.parametrize("command", ["collect", "calibrate", "simulate"])
+    def test_no_such_file(self, command, tmp_path):
+        arguments = [] if command == "simulate" else ["--out", tmp_path / "run"]
+        assert "does not exist" in failed(command, tmp_path / "nowhere.yaml", *arguments)
+
+    def test_a_simulation_that_is_none(self, tmp_path):
+        (tmp_path / "fleet.yaml").write_text("cameras: []\n")
+        assert "fleet.yaml" in self.one_line("simulate", tmp_path / "fleet.yaml")
+
+    def test_an_empty_folder(self, tmp_path):
+        text = self.one_line("collect", tmp_path, "--out", tmp_path / "run", "--board", "9x6")
+        assert "there are no photographs" in text
+
+    def test_photographs_without_a_board(self, tmp_path):
+        assert "--board" in failed("collect", tmp_path, "--out", tmp_path / "run")
+
+    def test_a_wrong_board(self, tmp_path):
+        cv2.imwrite(str(tmp_path / "wall.png"), np.full((120, 160), 128, np.uint8))
+        arguments = ("collect", tmp_path, "--out", tmp_path / "run", "--board")
+        assert "such as 9x6" in self.one_line(*arguments, "nine")
+        assert "wall.png shows no board of 9x6" in self.one_line(*arguments, "9x6")
+
+    def test_options_of_another_source(self, line_set, config, tmp_path):
+        out = ("--out", tmp_path / "run")
+        assert "goes with photographs" in failed("collect", line_set, *out, "--board", "9x6")
+        assert "go with photographs" in failed("collect", config(), *out, "--name", "gate")
+
+    def test_a_source_of_no_known_kind(self, tmp_path):
+        (tmp_path / "notes.txt").write_text("")
+        assert "neither" in failed("collect", tmp_path / "notes.txt", "--out", tmp_path / "run")
+
+    def test_lines_that_are_none(self, tmp_path):
+        np.savez(tmp_path / "other.npz", xy=np.zeros((3, 2)))
+        text = self.one_line("collect", tmp_path / "other.npz", "--out", tmp_path / "run")
+        assert "other.npz: not a set of lines: it lacks line, size" in text
+
+    def test_solving_what_was_not_collected(self, tmp_path):
+        assert "no such folder" in self.one_line("solve", tmp_path / "nowhere")
+        assert "no camera has been collected" in self.one_line("solve", tmp_path)
+
+    def test_powers_that_are_no_numbers(self, tmp_path):
+        assert "such as 1,2,3" in failed("solve", tmp_path, "--powers", "1,two")
+
+    def test_not_a_table(self, tmp_path):
+        (tmp_path / "table.json").write_text("{}")
+        text = self.one_line("rectify", tmp_path / "table.json", tmp_path, "-o", tmp_path / "out")
+        assert "table.json" in text
+
+    def test_a_zoom_beyond_the_table(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        solve(tmp_path / "run")
+        cv2.imwrite(str(tmp_path / "view.png"), np.zeros((480, 640), np.uint8))
+        text = self.one_line(
+            *("rectify", tmp_path / "run/harp/table.json", tmp_path / "view.png"),
+            *("-o", tmp_path / "out", "--zoom", 3),
+        )
+        assert "outside the calibrated range" in text
+
+    def test_would_overwrite_the_originals(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        solve(tmp_path / "run")
+        cv2.imwrite(str(tmp_path / "view.png"), np.zeros((480, 640), np.uint8))
+        table = tmp_path / "run/harp/table.json"
+        text = self.one_line("rectify", table, tmp_path / "view.png", "-o", tmp_path)
+        assert "would overwrite" in text
+
+
+class TestFleet:
+    def test_a_camera_that_does_not_answer(self, config, tmp_path):
+        path = config(
+            {"name": "gate", "address": "127.0.0.1:1"},  # nobody listens on port 1
+            dialect="sony_rz30",
+            zooms=[1],
+            timing={"connect_timeout_s": 1},
+        )
+        for command in ("collect", "calibrate"):
+            text = failed(command, path, "--out", tmp_path / command)
+            assert "camera gate (127.0.0.1:1)" in text
+            assert "Traceback" not in text
+            assert (tmp_path / command / "config.yaml").exists()
+
+    def test_calibrate_some(self, config, tmp_path, monkeypatch):
+        """One camera delivers, one fails: exit code 1, and the one has its table."""
+
+        def collect(config, out, progress):
+            progress("good", "zoom 1/1", 1, 2)
+            records = {}
+            for camera in config.cameras:
+                record = CameraRecord(name=camera.name, finished=True)
+                (out / camera.name).mkdir()
+                if camera.name == "good":
+                    pattern = save_patterns(out / "good", 0, synthetic.pattern_of(LENS))
+                    record.zooms = [ZoomRecord(magnification=1.0, patterns=pattern)]
+                else:
+                    record.error = "camera bad: switched off"
+                record.save(out / camera.name)
+                records[camera.name] = record
+            return records
+
+        monkeypatch.setattr("torchptz.fleet.calibrate.collect", collect)
+        cameras = [{"name": name, "address": name} for name in ("good", "bad")]
+        path = config(*cameras, dialect="sony_rz30", zooms=[1])
+        assert "switched off" in failed("collect", path, "--out", tmp_path / "a", code=1)
+        assert "switched off" in failed("calibrate", path, "--out", tmp_path / "b", code=1)
+        assert ZoomTable.load(tmp_path / "b" / "good" / "table.json").zooms == [1.0]
+
+
+class TestSimulate:
+    def test_serves_until_interrupted(self, tmp_path):
+        path = tmp_path / "sim.yaml"
+        path.write_text("cameras: [{name: gate, user: null, scene: {board: null}}]\n")
+        ready, truth = tmp_path / "ready.json", tmp_path / "truth.json"
+        process = subprocess.Popen(
+            [sys.executable, "-m", "torchptz.cli", "simulate", str(path)]
+            + ["--ready-file", str(ready), "--truth", str(truth)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            deadline = time.monotonic() + 30
+            while not ready.exists() and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.05)
+            addresses = json.loads(ready.read_text())
+            assert addresses["gate"].startswith("127.0.0.1:")
+            assert truth.exists()
+            os.kill(process.pid, signal.SIGINT)
+            output, errors = process.communicate(timeout=15)
+        finally:
+            process.kill()
+        assert process.returncode == 0
+        assert output == f"gate: {addresses['gate']}\n"
+        assert "Traceback" not in errors

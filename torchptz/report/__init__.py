@@ -1,0 +1,1 @@
+"""Pictures of patterns, convergence and corrections, for reports and scripts."""
