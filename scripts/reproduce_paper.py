@@ -180,8 +180,9 @@ def _remarks(result: dict) -> list[str]:
         f"With l0 fixed and no noise the residual is {fixed['rms_over_floor']:.3g} times its floor "
         f"after {fixed['iterations']} iterations (paper: it takes more than 2000), and the lens is "
         f"{fixed['largest_error_raw_px']:.2g} px off.",
-        "The paper does not list its lines. These begin with variances like its own. With others, "
-        "some of them near the centre, the same loop needs "
+        "The paper does not list its lines. These begin with variances like its own and are among "
+        "the better ones of that kind: without noise, others took up to 15 iterations and erred by "
+        "up to 0.09 px as they are. With lines near the centre among them the same loop needs "
         f"{other['iterations_to_floor']} iterations (at 0.05 px).",
         "White noise of 0.483 px, the root of the paper's mean variance, leaves a centre that is "
         f"{loud['center_error_px']:.1f} px off in the median (sigma in x and y, from the "

@@ -26,13 +26,13 @@ import torch
 import yaml
 from rich.console import Console
 from rich.table import Table
-from torchptz.report.figures import draw_before_after
 
 import torchptz as tp
 from torchptz.cameras import Credentials, Pose, open_camera
 from torchptz.fleet.calibrate import calibrate
 from torchptz.fleet.config import parse_config
 from torchptz.fleet.solve import TABLE_NAME, TABLE_NAME_WITHOUT, Summary, solve
+from torchptz.report.figures import draw_before_after
 from torchptz.simulation import CameraTruth, SimulationConfig, compare_lens, load_truth
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"

@@ -7,6 +7,7 @@ and interpolated: less than 0.002 px off for spots, 0.01 px for the board.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import cos, radians, sin
 
 import cv2
@@ -113,11 +114,28 @@ class World:
 
 def draw_text(frame: np.ndarray, text: str) -> None:
     """White letters with a dark rim in the lower left corner, where cameras write theirs."""
-    place = (8, frame.shape[0] - 10)
-    for colour, width in ((0, 3), (235, 1)):
-        cv2.putText(
-            frame, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (colour,) * 3, width, cv2.LINE_AA
-        )
+    ink, cover = _letters(text, frame.shape[0], frame.shape[1])
+    part = frame[-ink.shape[0] :]
+    part[:] = np.rint(ink + (1 - cover) * part)
+
+
+@lru_cache(maxsize=64)
+def _letters(text: str, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """What a text adds to a strip at the picture's bottom, and how much of the picture it hides.
+
+    Drawn once: OpenCV loads its font anew in every thread, and each request has its own.
+    """
+    rows = min(height, 40)
+    strips = []
+    for ground in (0, 255):
+        strip = np.full((rows, width, 3), ground, np.uint8)
+        for colour, stroke in ((0, 3), (235, 1)):
+            place, colours = (8, rows - 10), (colour,) * 3
+            cv2.putText(
+                strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colours, stroke, cv2.LINE_AA
+            )
+        strips.append(strip.astype(np.float32))
+    return strips[0], 1 - (strips[1] - strips[0]) / 255
 
 
 def _highlight(config: HighlightConfig) -> Spot:
