@@ -26,9 +26,12 @@ class Batched:
                 return len(value)
         raise TypeError(f"{type(self).__name__} has no batched field")
 
-    def __getitem__(self, index: int | slice) -> Self:
-        """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``."""
-        if not isinstance(index, slice):
+    def __getitem__(self, index: int | slice | Tensor) -> Self:
+        """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``.
+
+        A one-dimensional tensor of indices takes those items, where no field is a list.
+        """
+        if not isinstance(index, slice | Tensor):
             index = operator.index(index)
             if not -len(self) <= index < len(self):
                 raise IndexError(f"item {index} of a batch of {len(self)}")
@@ -39,6 +42,16 @@ class Batched:
             for field in fields(self)
             if field.name not in self._shared and getattr(self, field.name) is not None
         }
+        return replace(self, **changed)
+
+    def with_items(self, index: Tensor, items: Self) -> Self:
+        """The same batch with the items of ``index`` replaced by those of another batch."""
+        changed = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in self._shared and value is not None:
+                changed[field.name] = value.clone()
+                changed[field.name][index] = getattr(items, field.name)
         return replace(self, **changed)
 
     def to(self, device: torch.device | str) -> Self:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -80,14 +80,16 @@ def estimate(
     start = start.expand_as(problem.image_size)
     hold = torch.zeros(len(problem), dtype=torch.bool, device=start.device)
 
-    def solve(hold: Tensor) -> _Solution:
-        return _solve(problem, start, hold, free_l0, max_iterations, variance_threshold)
+    def solve(items: Problem, start: Tensor, hold: Tensor) -> _Solution:
+        return _solve(items, start, hold, free_l0, max_iterations, variance_threshold)
 
-    solution = solve(hold)
+    solution = solve(problem, start, hold)
     # Next to no distortion leaves the centre undetermined, and it would drag L along.
     hold = center_unobservable(solution.coefficients, solution.covariance, problem.scale)
-    if hold.any():
-        solution = _choose(hold, solve(hold), solution)
+    rows = hold.nonzero()[:, 0]
+    if len(rows):
+        again = solve(problem[rows], start[rows], hold[rows])
+        solution = solution.with_items(rows, again)
     return _as_fit(problem, solution, hold)
 
 
@@ -132,17 +134,6 @@ def _solve(
     return _Solution(
         center, coefficients, gain, now.residual, iterations, converged, rms, covariance
     )
-
-
-def _choose(mask: Tensor, new: _Solution, old: _Solution) -> _Solution:
-    """``new`` for the items of the mask, ``old`` for the others."""
-
-    def pick(a: Tensor | None, b: Tensor | None) -> Tensor | None:
-        if a is None or b is None:
-            return None
-        return torch.where(mask.reshape(-1, *([1] * (a.ndim - 1))), a, b)
-
-    return _Solution(*(pick(getattr(new, f.name), getattr(old, f.name)) for f in fields(new)))
 
 
 def _as_fit(problem: Problem, solution: _Solution, hold: Tensor) -> Fit:

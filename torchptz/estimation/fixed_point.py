@@ -7,10 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchptz.batch import Batched
 from torchptz.estimation.center import center_step
 from torchptz.estimation.coefficients import solve_coefficients
 from torchptz.estimation.lines import fit_lines
 from torchptz.estimation.problem import Problem
+
+_ROUND = 20  # iterations between two looks at which items are still active
+_BLOWN_UP = 1e6  # a coefficient beyond it belongs to no lens
 
 
 @dataclass(frozen=True)
@@ -72,18 +76,75 @@ def iterate(
     Source: paper, section 2; stopping on l and c both: on real sets the change of l alone can stop
     8-17 px away from the centre.
     """
-    coefficients = center.new_zeros(len(center), len(problem.powers))
     active = torch.ones(len(center), dtype=torch.bool, device=center.device)
-    converged = ~active
-    iterations = torch.zeros(len(center), dtype=torch.long, device=center.device)
-    history: list[Tensor] = []
-    for _ in range(max_iterations):
-        if record or variance_threshold is not None:
+    state = _State(
+        center,
+        center.new_zeros(len(center), len(problem.powers)),
+        torch.zeros(len(center), dtype=torch.long, device=center.device),
+        ~active,
+        active,
+    )
+    stop = _Stop(tolerance_l, tolerance_center, variance_threshold)
+    history: list[Tensor] | None = [] if record else None
+    # In rounds, each of the items that are still active: a few slow ones do not make all the
+    # others be computed along.
+    length = max_iterations if record else _ROUND
+    for begun in range(0, max_iterations, length):
+        rows = state.active.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        part = _advance(
+            problem[rows],
+            state[rows],
+            None if gain is None else gain[rows],
+            None if hold_center is None else hold_center[rows],
+            free_l0,
+            min(length, max_iterations - begun),
+            stop,
+            history,
+        )
+        state = state.with_items(rows, part)
+    return FixedPoint(
+        state.center, state.coefficients, state.iterations, state.converged, history or []
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State(Batched):
+    center: Tensor
+    coefficients: Tensor
+    iterations: Tensor
+    converged: Tensor
+    active: Tensor
+
+
+@dataclass(frozen=True)
+class _Stop:
+    tolerance_l: float
+    tolerance_center: float
+    variance_threshold: float | None
+
+
+def _advance(
+    problem: Problem,
+    state: _State,
+    gain: Tensor | None,
+    hold_center: Tensor | None,
+    free_l0: bool,
+    steps: int,
+    stop: _Stop,
+    history: list[Tensor] | None,
+) -> _State:
+    """Up to ``steps`` iterations of every active item."""
+    center, coefficients, active = state.center, state.coefficients, state.active
+    iterations, converged = state.iterations, state.converged
+    for _ in range(steps):
+        if history is not None or stop.variance_threshold is not None:
             variances = line_variances(problem, problem.correct(center, coefficients, gain))
-            if record:
+            if history is not None:
                 history.append(variances)
-            if variance_threshold is not None:
-                done = active & (variances.nanmean(-1) < variance_threshold)
+            if stop.variance_threshold is not None:
+                done = active & (variances.nanmean(-1) < stop.variance_threshold)
                 converged, active = converged | done, active & ~done
         if not active.any():
             break
@@ -91,20 +152,19 @@ def iterate(
         if hold_center is not None:
             moved = torch.where(hold_center.unsqueeze(-1), center, moved)
         # The lines are fitted again after the centre moved: with stale ones the loop ends in a
-        # cycle of period two on noisy data (paper.md, 4.3).
+        # cycle of period two on noisy data.
         lines = fit_lines(problem.correct(moved, coefficients, gain), problem.weight)
         solved = solve_coefficients(problem, moved, lines, gain, free_l0)
         # A blown-up item keeps its last good state and stops alone; the SVDs of the others never
         # see its numbers.
-        finite = solved.isfinite().all(-1) & (solved.abs().amax(-1) < 1e6)
-        active = active & finite
+        active = active & solved.isfinite().all(-1) & (solved.abs().amax(-1) < _BLOWN_UP)
         change_l = (solved - coefficients).abs().amax(-1)
         change_c = torch.linalg.vector_norm(moved - center, dim=-1)
         center = torch.where(active.unsqueeze(-1), moved, center)
         coefficients = torch.where(active.unsqueeze(-1), solved, coefficients)
         iterations = iterations + active
-        done = active & (change_l <= tolerance_l) & (change_c <= tolerance_center)
+        done = active & (change_l <= stop.tolerance_l) & (change_c <= stop.tolerance_center)
         converged, active = converged | done, active & ~done
-    if record:
+    if history is not None:
         history.append(line_variances(problem, problem.correct(center, coefficients, gain)))
-    return FixedPoint(center, coefficients, iterations, converged, history)
+    return _State(center, coefficients, iterations, converged, active)

@@ -15,8 +15,9 @@ CENTER_SIGMA_LIMIT = 0.25
 # l' C^-1 l per coefficient, below which L cannot be told from 1: the centre then follows the noise,
 # much farther than its linearised covariance says.
 SEEN_LIMIT = 10.0
-# A correction at the image's farthest corner known no better than this, in px, is not known.
-CORNER_SIGMA_LIMIT_PX = 5.0
+# A correction at the image's farthest corner known no better than this part of the half width is
+# not known.
+CORNER_SIGMA_LIMIT = 0.01
 
 
 class Status(Enum):
@@ -71,13 +72,15 @@ def center_unobservable(coefficients: Tensor, covariance: Tensor, scale: Tensor)
 
 
 def corner_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
-    """(B,) px, standard deviation of ``r L(r)`` at the farthest corner for a known centre.
+    """(B,) px, standard deviation of ``r L(r)`` at the farthest corner, for a known centre and up
+    to the size of the whole picture.
 
-    Lines say nothing about a projective change of the picture, yet with L(0) = 1 and the centre
-    held what is left of it in a radial correction is small.
+    Straightness hardly fixes the size. Over a disc of radius R, the scale that fits ``r^(p+1)``
+    best (least squares over its area) is ``4 R^p / (p + 4)``; what it leaves at R is
+    ``R^(p+1) p / (p + 4)``.
     """
-    radius = lens.farthest_corner() / lens.scale
-    lever = lens.scale[:, None] * radius[:, None] ** (lens.powers + 1)
+    radius = (lens.farthest_corner() / lens.scale)[:, None]
+    lever = lens.scale[:, None] * radius ** (lens.powers + 1) * lens.powers / (lens.powers + 4)
     block = covariance[:, 2 : 2 + lens.powers.numel(), 2 : 2 + lens.powers.numel()]
     known = block.isfinite().all((1, 2))
     variance = torch.einsum("bi,bij,bj->b", lever, block.nan_to_num(0.0, 0.0, 0.0), lever)
@@ -103,7 +106,7 @@ def judge(
         (Status.TOO_FEW_LINES, too_few(problem)),
         (
             Status.DISTORTION_UNOBSERVABLE,
-            ~(corner_sigma(lens, covariance) <= CORNER_SIGMA_LIMIT_PX),
+            ~(corner_sigma(lens, covariance) <= CORNER_SIGMA_LIMIT * lens.scale),
         ),
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
