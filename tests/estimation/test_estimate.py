@@ -215,9 +215,9 @@ class TestItems:
                 if getattr(alone, name) is None:
                     continue
                 a, b = getattr(together, name)[i].abs(), getattr(alone, name)[0].abs()
-                torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
+                torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
             torch.testing.assert_close(
-                together.lens.center[i], alone.lens.center[0], rtol=0, atol=1e-4
+                together.lens.center[i], alone.lens.center[0], rtol=0, atol=1e-5
             )
             torch.testing.assert_close(
                 together.lens.coefficients[i], alone.lens.coefficients[0], rtol=0, atol=1e-7
@@ -232,5 +232,5 @@ class TestItems:
         assert fit.status[0] != Status.OK
         assert fit.status[1] == Status.OK
         torch.testing.assert_close(
-            fit.lens.center[1], estimate(good).lens.center[0], atol=1e-4, rtol=0
+            fit.lens.center[1], estimate(good).lens.center[0], atol=1e-5, rtol=0
         )

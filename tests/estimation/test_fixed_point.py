@@ -131,7 +131,7 @@ class TestItems:
             assert together.iterations[i] == alone.iterations[0]
             torch.testing.assert_close(together.center[i], alone.center[0], atol=1e-6, rtol=0)
             torch.testing.assert_close(
-                together.coefficients[i], alone.coefficients[0], atol=1e-9, rtol=0
+                together.coefficients[i], alone.coefficients[0], atol=1e-8, rtol=0
             )
 
     @pytest.mark.parametrize("bad", [float("nan"), 1e200, "one place", "two places"])

@@ -241,7 +241,7 @@ def errors(fit, truths):
 
 @pytest.mark.parametrize("name", ZOOMS)
 class TestHead:
-    """paper.md, 4.10: what the head says about where it stopped."""
+    """What the head says about where it stopped, used as known offsets."""
 
     def test_the_gain_makes_up_for_the_focal_length(self, heads, name):
         fit, _, _ = heads[name]

@@ -14,6 +14,7 @@ _HALVINGS = 8
 # Mean square change of a residual per px of centre below which the centre is not moved: without
 # distortion the objective does not depend on the centre and its gradient is rounding.
 _FLAT = 1e-10
+_ROUNDING = 1e-11  # relative, of the objective
 
 
 def center_step(
@@ -40,7 +41,7 @@ def center_step(
     Returns:
         (B, 2) px.
 
-    Source: paper, section 2 (the centre's nonlinear step), refitting after paper.md, 4.3.
+    Source: paper, section 2 (the centre's nonlinear step); refitting: README, "Beyond the paper".
     """
     for _ in range(steps):
         gradient, curvature, value = _derivatives(problem, center, coefficients, gain)
@@ -91,9 +92,11 @@ def _backtrack(
     """Halve each item's step until its objective falls; (B, 2)."""
     waiting = torch.ones_like(value, dtype=torch.bool)
     moved = center
+    # At the optimum, rounding must not decide whether the last small steps count.
+    limit = value * (1 + _ROUNDING)
     for _ in range(_HALVINGS):
         trial = torch.where(waiting.unsqueeze(-1), center + step, moved)
-        falls = waiting & (_objective(problem, trial, coefficients, gain) <= value)
+        falls = waiting & (_objective(problem, trial, coefficients, gain) <= limit)
         moved = torch.where(falls.unsqueeze(-1), trial, moved)
         waiting = waiting & ~falls
         if not waiting.any():

@@ -26,7 +26,9 @@ class Fit(Batched):
     """Lenses of a batch of patterns, and how well they are known."""
 
     lens: RadialLens
-    rms_px: Tensor  # (B,) px, straightness in the distorted picture per degree of freedom
+    # (B,) px, straightness in the distorted picture per degree of freedom; where points have
+    # sigmas, weighted by 1/sigma² relative to the mean weight
+    rms_px: Tensor
     residuals: Tensor  # (B, L, P) px, straightness of every point, 0 for padding
     iterations: Tensor  # (B,)
     covariance: Tensor  # (B, 2 + K, 2 + K), order cx, cy, l...
@@ -43,7 +45,7 @@ def estimate(
     center: Tensor | None = None,
     pixel_aspect: Tensor | float = 1.0,
     free_l0: bool = True,
-    max_iterations: int = 500,
+    max_iterations: int = 1000,
     variance_threshold: float | None = None,
 ) -> Fit:
     """Estimate the lens of every pattern of a batch.
@@ -67,7 +69,7 @@ def estimate(
     Raises:
         ValueError: unknown method, powers that are not positive and increasing.
 
-    Source: paper, section 2; offsets: paper.md, 4.10.
+    Source: paper, section 2; offsets: README, "Beyond the paper".
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")

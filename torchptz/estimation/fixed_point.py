@@ -49,9 +49,9 @@ def iterate(
     gain: Tensor | None = None,
     hold_center: Tensor | None = None,
     free_l0: bool = True,
-    max_iterations: int = 500,
-    tolerance_l: float = 1e-7,
-    tolerance_center: float = 1e-4,
+    max_iterations: int = 1000,
+    tolerance_l: float = 1e-8,
+    tolerance_center: float = 1e-5,
     variance_threshold: float | None = None,
     record: bool = False,
 ) -> FixedPoint:

@@ -61,7 +61,7 @@ def project_out_lines(
         weight: (..., P).
         points: (..., P, 2) px, corrected points.
         lines: their lines.
-        gradient: (..., P) divisor of each residual (`residuals.gradient_norm`), default 1.
+        gradient: (..., P) divisor of each residual (`Straightness.gradient`), default 1.
 
     Returns:
         (..., P, M), zero where the weight is.

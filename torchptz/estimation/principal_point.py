@@ -96,7 +96,7 @@ def estimate_magnification(
         magnification (B, Z), 1 at level 0, NaN where no track reaches a level, and its standard
         deviation relative to level 0 (B, Z), 0 at level 0.
 
-    Source: paper.md, 4.12.
+    Source: README, "Beyond the paper".
     """
     weight = mask.double()
     away = torch.where(mask.unsqueeze(-1), tracks - principal_point[:, None, None], 0.0)

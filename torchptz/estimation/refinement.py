@@ -13,8 +13,9 @@ from torchptz.estimation.residuals import Straightness, distance_gradient, strai
 
 _MAX_STEPS = 60
 _DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
-_STEP_TOLERANCE = 1e-9  # of the length of the scaled parameters
-_FALL_TOLERANCE = 1e-12  # relative fall of the cost
+# Promised fall of the cost, relative: a thousandth of a sigma of the estimate, squared.
+_FALL_TOLERANCE = 1e-9
+_EXACT_PX = 1e-10  # rms residual of noise-free points; rounding keeps it from falling further
 _FARTHEST_STEP = 0.2  # units of r, for the centre
 
 
@@ -40,7 +41,7 @@ def refine(
 
     A loop that alternates the gain of the known offsets with the lines stalls at the long end of
     the zoom, where the offsets are larger than the distortion; solved together it takes a few
-    steps (paper.md, 4.10).
+    steps.
 
     Args:
         problem: B items.
@@ -59,30 +60,29 @@ def refine(
     converged = torch.zeros_like(active)
     iterations = torch.zeros_like(active, dtype=torch.long)
     for _ in range(_MAX_STEPS):
-        if not active.any():
-            break
         columns, residual = jacobian(problem, state, now)
         if hold_center is not None:
-            held = hold_center[:, None, None] & (torch.arange(columns.shape[-1]) < 2).to(
-                hold_center
-            )
-            columns = torch.where(held, 0.0, columns)
-        step, predicted = _damped_step(columns, residual, damping)
-        limit = _FARTHEST_STEP * problem.scale
+            is_center = torch.arange(columns.shape[-1], device=columns.device) < 2
+            columns = torch.where(hold_center[:, None, None] & is_center, 0.0, columns)
+        normal = columns.transpose(1, 2) @ columns
+        right = -(columns.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
+        # What an undamped step promises, however much the next one is damped: a step that is small
+        # only because its damping is high does not pass for convergence.
+        promised = (right * _solve_damped(normal, right, torch.zeros_like(damping))).sum(-1)
+        done = active & (promised <= _FALL_TOLERANCE * now.cost + _EXACT_PX**2 * problem.count)
+        converged, active = converged | done, active & ~done
+        if not active.any():
+            break
+        step = _solve_damped(normal, right, damping)
         length = torch.linalg.vector_norm(step[:, :2], dim=-1).clamp_min(1e-300)
-        step = step * (limit / length).clamp(max=1.0)[:, None]
-        trial_state = state + step
-        trial = straightness(problem, *unpack(trial_state, problem))
+        step = step * (_FARTHEST_STEP * problem.scale / length).clamp(max=1.0)[:, None]
+        trial = straightness(problem, *unpack(state + step, problem))
         better = active & (trial.cost <= now.cost)
-        fall = (now.cost - trial.cost) / now.cost.clamp_min(1e-300)
-        small = predicted <= _STEP_TOLERANCE * torch.linalg.vector_norm(state, dim=-1)
         iterations = iterations + active
-        state = torch.where(better[:, None], trial_state, state)
+        state = torch.where(better[:, None], state + step, state)
         now = _choose(better, trial, now)
         damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
-        done = active & (small | (better & (fall <= _FALL_TOLERANCE)))
-        converged = converged | done
-        active = active & ~done & (damping < _DAMPING_HIGHEST)
+        active = active & (damping < _DAMPING_HIGHEST)
     return Refined(*unpack(state, problem), iterations, converged)
 
 
@@ -152,18 +152,15 @@ def _without_lines(
     return project_out_lines(columns, problem.weight, corrected, lines, gradient)
 
 
-def _damped_step(columns: Tensor, residual: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """Marquardt step (B, M) and its length in scaled parameters (B,)."""
-    normal = columns.transpose(1, 2) @ columns
-    right = -(columns.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
+def _solve_damped(normal: Tensor, right: Tensor, damping: Tensor) -> Tensor:
+    """Marquardt step (B, M); 0 where the system cannot be solved."""
     diagonal = normal.diagonal(dim1=1, dim2=2)
     # Columns that carry nothing (the centre's while L is 1) must not divide by zero: their
     # parameter then stays where it is.
     floor = 1e-12 * diagonal.amax(-1, keepdim=True).clamp_min(1e-300)
     damped = normal + torch.diag_embed(damping[:, None] * diagonal + floor)
     step = torch.linalg.solve_ex(damped, right.unsqueeze(-1)).result.squeeze(-1)
-    step = torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
-    return step, torch.linalg.vector_norm(step, dim=-1)
+    return torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
 
 
 def _choose(better: Tensor, trial: Straightness, now: Straightness) -> Straightness:
