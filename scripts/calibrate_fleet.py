@@ -6,6 +6,7 @@ import sys
 
 from torchptz.fleet.calibrate import calibrate
 from torchptz.fleet.config import ConfigError
+from torchptz.fleet.progress import Stages
 
 
 def main() -> int:
@@ -15,9 +16,7 @@ def main() -> int:
     parser.add_argument("--powers", type=float, nargs="+", default=[1, 2, 3], help="of r in L")
     options = parser.parse_args()
 
-    def progress(camera: str, what: str, done: int, total: int) -> None:
-        print(f"{camera}: {what} ({done}/{total})", file=sys.stderr)
-
+    progress = Stages(lambda line: print(line, file=sys.stderr))
     try:
         summary = calibrate(options.config, options.out, options.powers, progress)
     except ConfigError as error:

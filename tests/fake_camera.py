@@ -105,6 +105,7 @@ class FakeObserver:
         seen = self.camera.ball(at)
         size = self.camera.lens.image_size[0].numpy()
         whole = ((seen > self.radius - 0.5) & (seen < size - 0.5 - self.radius)).all()
+        near = near(at) if callable(near) else near
         near_enough = np.linalg.norm(seen - near) <= search_radius
         found = bool(whole and near_enough and not self.blind(number))
         self.searches.append((np.asarray(near), search_radius))

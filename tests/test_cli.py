@@ -1,6 +1,8 @@
 """The command line: help, one line for what goes wrong, exit codes, and a small run."""
 
+import io
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -12,11 +14,12 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from rich.console import Console
 
 from tests import synthetic
-from torchptz.cli import main
+from torchptz.cli import _summary_table, main
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
-from torchptz.fleet.solve import solve
+from torchptz.fleet.solve import CameraResult, Summary, ZoomResult, solve
 from torchptz.rectification import rectify
 from torchptz.zoom_table import ZoomTable
 
@@ -26,6 +29,15 @@ LENS = synthetic.lens()
 
 def run(*arguments):
     return CliRunner().invoke(main, [str(one) for one in arguments])
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_it_was():
+    """Every call of the command sets what is logged, for the whole process."""
+    ours = logging.getLogger("torchptz")
+    level = ours.level
+    yield
+    ours.setLevel(level)
 
 
 def failed(*arguments, code=2) -> str:
@@ -119,6 +131,89 @@ class TestSmallRun:
         assert not (folder / "table.json").exists()
 
 
+class TestFromFiles:
+    """What `collect` is told about photographs and lines."""
+
+    def test_zoom_and_pixel_aspect(self, line_set, tmp_path):
+        out = tmp_path / "run"
+        arguments = ("--zoom", 12, "--pixel-aspect", 0.985)
+        assert run("collect", line_set, "--out", out, *arguments).exit_code == 0
+        assert run("solve", out).exit_code == 0
+        table = ZoomTable.load(out / "harp" / "table.json")
+        assert table.zooms == [12.0]
+        assert table.lens.pixel_aspect.tolist() == [0.985]
+
+    @pytest.mark.parametrize("option", ["--zoom", "--pixel-aspect"])
+    def test_values_that_are_none(self, line_set, tmp_path, option):
+        text = failed("collect", line_set, "--out", tmp_path / "run", option, "-1")
+        assert "must be positive" in text
+
+    def test_a_second_time_is_refused_with_the_way_out(self, line_set, tmp_path):
+        arguments = ("collect", line_set, "--out", tmp_path / "run")
+        assert run(*arguments).exit_code == 0
+        text = failed(*arguments)
+        assert "--name" in text
+        assert "--out" in text
+        assert run(*arguments, "--name", "other").exit_code == 0
+
+    @pytest.mark.parametrize(("broken", "code"), [(False, 0), (True, 1)])
+    def test_a_photograph_without_a_board_is_no_failure_an_unreadable_one_is(
+        self, tmp_path, monkeypatch, broken, code
+    ):
+        album = tmp_path / "album"
+        album.mkdir()
+        cv2.imwrite(str(album / "wall.png"), np.full((480, 640), 128, np.uint8))
+        cv2.imwrite(str(album / "view.png"), np.zeros((480, 640), np.uint8))
+        if broken:
+            noise = np.random.default_rng(0).integers(0, 255, (480, 640), dtype=np.uint8)
+            data = cv2.imencode(".jpg", noise)[1].tobytes()
+            (album / "cut.jpg").write_bytes(data[: len(data) // 2])
+        grid = np.stack(np.meshgrid(np.arange(100.0, 400, 50), np.arange(100.0, 400, 60)), -1)
+        monkeypatch.setattr(
+            "torchptz.fleet.photographs.find_corners",
+            lambda picture, board: None if picture.all() else grid,
+        )
+        result = run("collect", album, "--out", tmp_path / "run", "--board", "6x5")
+        assert result.exit_code == code
+        assert "skipped: wall.png shows no board" in result.stderr
+        assert ("failed: cut.jpg is " in result.stderr) == broken
+        assert f"1 of {2 + broken} photographs used" in result.output
+
+
+class TestSummaryTable:
+    def test_a_row_keeps_to_its_line_on_80_columns(self):
+        zooms = [
+            ZoomResult(
+                *(12.0, 11.97, 16384.0, status == "OK", status),
+                **{"rms_px": 0.1234, "gain": 1.0071, "gain_sigma": 0.0062},
+                **{"center": (368.46, 270.61), "lines": 20, "points": 12345},
+            )
+            for status in ("OK", "CENTER_UNOBSERVABLE", "DISTORTION_UNOBSERVABLE")
+        ]
+        cameras = {
+            "entrance": CameraResult(tuple(zooms), "t", None),
+            "a-very-long-name-of-a-camera": CameraResult(tuple(zooms), "t", None),
+            "dead": CameraResult((), None, "switched off"),
+        }
+        text = io.StringIO()
+        Console(file=text, width=80).print(_summary_table(Summary(cameras), "Lenses"))
+        rows = [line.rstrip() for line in text.getvalue().splitlines() if "0.123" in line]
+        assert len(rows) == 6
+        for row in rows:
+            assert row.split()[-3:] == ["1.007±0.006", "368.5,270.6", "12345"]
+            assert row.split()[1] == "11.97"
+        assert rows[2].split()[0] == "entrance"
+        assert "dead" in text.getvalue()
+
+    def test_a_gain_of_unknown_sigma(self):
+        zoom = ZoomResult(None, 1.0, None, True, "OK", rms_px=0.1, gain=1.0, gain_sigma=None)
+        text = io.StringIO()
+        summary = Summary({"a": CameraResult((zoom,), "t", None)})
+        Console(file=text, width=80).print(_summary_table(summary, "Lenses"))
+        assert "1.000 " in text.getvalue()
+        assert "±" not in text.getvalue()
+
+
 class TestPartlyFailed:
     """Exit code 1: some is there, and the rest is named."""
 
@@ -199,7 +294,8 @@ class TestWrongInput:
     def test_options_of_another_source(self, line_set, config, tmp_path):
         out = ("--out", tmp_path / "run")
         assert "goes with photographs" in failed("collect", line_set, *out, "--board", "9x6")
-        assert "go with photographs" in failed("collect", config(), *out, "--name", "gate")
+        for option, value in (("--name", "gate"), ("--zoom", 2), ("--pixel-aspect", 1)):
+            assert "go with photographs" in failed("collect", config(), *out, option, value)
 
     def test_a_source_of_no_known_kind(self, tmp_path):
         (tmp_path / "notes.txt").write_text("")
@@ -260,6 +356,7 @@ class TestFleet:
 
         def collect(config, out, progress):
             progress("good", "zoom 1/1", 1, 2)
+            progress("good", "zoom 1/1", 2, 2)
             records = {}
             for camera in config.cameras:
                 record = CameraRecord(name=camera.name, finished=True)
@@ -277,7 +374,13 @@ class TestFleet:
         cameras = [{"name": name, "address": name} for name in ("good", "bad")]
         path = config(*cameras, dialect="sony_rz30", zooms=[1])
         assert "switched off" in failed("collect", path, "--out", tmp_path / "a", code=1)
-        assert "switched off" in failed("calibrate", path, "--out", tmp_path / "b", code=1)
+        # What an earlier configuration has left there is none of this one's business.
+        (tmp_path / "b" / "gone").mkdir(parents=True)
+        CameraRecord(name="gone", error="camera gone: was taken down").save(tmp_path / "b/gone")
+        text = failed("calibrate", path, "--out", tmp_path / "b", code=1)
+        assert "switched off" in text
+        assert text.count("good: zoom 1/1") == 1  # progress where no bar can be drawn
+        assert "taken down" not in text
         assert ZoomTable.load(tmp_path / "b" / "good" / "table.json").zooms == [1.0]
 
 

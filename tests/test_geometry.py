@@ -89,38 +89,6 @@ class TestValues:
             assert abs(float(plane @ ray)) < 1e-12
         assert float(torch.linalg.vector_norm(plane)) == pytest.approx(1)
 
-    @given(pan=angles, pan0=angles, tilt0=st.floats(-1.2, 1.2), seed=st.integers(0, 999))
-    @settings(max_examples=60, deadline=None)
-    def test_tilts_on_a_plane_solve_its_equation(self, pan, pan0, tilt0, seed):
-        plane = torch.from_numpy(np.random.default_rng(seed).normal(size=3))
-        ray = geometry.ray_from_pan_tilt(tensor(pan0), tensor(tilt0))[0]
-        both = geometry.tilt_on_plane(plane, ray, scalar(pan))
-        for tilt in both:
-            if not tilt.isnan():
-                seen = geometry.to_camera(ray, scalar(pan), tilt)
-                # acos loses half the digits where the plane only just touches the circle
-                assert abs(float(plane @ seen)) < 1e-7
-        # NaN only where scanning all tilts finds no sign change.
-        if both[0].isnan():
-            every = torch.linspace(-math.pi, math.pi, 721, dtype=torch.float64)
-            seen = geometry.to_camera(ray, scalar(pan), every)
-            side = torch.sign(seen @ plane)
-            assert bool((side == side[0]).all())
-
-    def test_tilt_on_plane_finds_both_tilts(self):
-        # The horizontal plane through the axis, and a ray at the height of 0.2 rad.
-        plane, ray = tensor(0.0, 1.0, 0.0), geometry.ray_from_pan_tilt(tensor(0.0), tensor(0.2))
-        tilts_found = torch.stack(geometry.tilt_on_plane(plane, ray[0], tensor(0.0)[0])).sort()[0]
-        torch.testing.assert_close(tilts_found, tensor(0.2 - math.pi, 0.2))
-
-    def test_no_tilt_reaches_a_plane_beside_the_ray(self):
-        plane = tensor(1.0, 0.0, 0.1)
-        on_the_tilt_axis, beside = tensor(1.0, 0.0, 0.0), tensor(0.5, 0.0, 1.0)
-        for ray in (on_the_tilt_axis, beside):
-            first, second = geometry.tilt_on_plane(plane, ray, scalar(0.0))
-            assert first.isnan()
-            assert second.isnan()
-
     def test_behind_the_camera_is_nowhere(self):
         seen = geometry.project(tensor(1.0, 2.0, -4.0, 1.0, 2.0, 0.0, 1.0, 2.0, 4.0).reshape(3, 3))
         assert bool(seen[:2].isnan().all())
@@ -177,21 +145,51 @@ class TestGradients:
         )
         assert torch.autograd.gradcheck(geometry.line_plane, inputs)
 
-    def test_tilt_on_plane(self):
-        inputs = (
-            tensor(0.1, 1.0, 0.2, grad=True),
-            tensor(0.2, 0.3, 0.9, grad=True),
-            torch.tensor(0.25, dtype=torch.float64, requires_grad=True),
-        )
-        assert torch.autograd.gradcheck(geometry.tilt_on_plane, inputs)
+    def test_pan_tilt_from_ray(self):
+        rays = tensor(0.2, 0.3, 0.9, -1.0, -2.0, -0.5).reshape(2, 3).requires_grad_()
+        assert torch.autograd.gradcheck(geometry.pan_tilt_from_ray, rays)
 
-    def test_a_plane_out_of_reach_leaves_the_gradients_of_others_alone(self):
-        plane = tensor(1.0, 0.01, 0.0, 0.1, 1.0, 0.2).reshape(2, 3)
-        pan = tensor(-0.6, 0.2, grad=True)
-        ray = tensor(0.2, 0.3, 0.9)
-        tilt, _ = geometry.tilt_on_plane(plane, ray, pan)
-        assert tilt.isnan().tolist() == [True, False]
-        torch.where(tilt.isnan(), 0.0, tilt).sum().backward()
-        assert bool(pan.grad.isfinite().all())
-        assert pan.grad[0] == 0
-        assert pan.grad[1] != 0
+    @pytest.mark.parametrize("y", [-2.0, 1.0])
+    def test_a_pole_has_a_finite_gradient_and_leaves_others_alone(self, y):
+        rays = tensor(0.0, y, 0.0, 0.2, 0.3, 0.9).reshape(2, 3).requires_grad_()
+        pan, tilt = geometry.pan_tilt_from_ray(rays)
+        torch.testing.assert_close(tilt[0].detach(), scalar(math.copysign(math.pi / 2, y)))
+        assert pan[0] == 0
+        (pan + tilt).sum().backward()
+        torch.testing.assert_close(rays.grad[0], torch.zeros(3).double())
+        alone = tensor(0.2, 0.3, 0.9, grad=True)
+        sum(geometry.pan_tilt_from_ray(alone)).backward()
+        torch.testing.assert_close(rays.grad[1], alone.grad)
+
+    def test_pan_tilt_to_see(self):
+        inputs = (
+            tensor(0.2, 0.3, 0.9, grad=True),
+            tensor(0.1, -0.2, 1.0, -0.3, 0.2, 1.0).reshape(2, 3).requires_grad_(),
+        )
+        assert torch.autograd.gradcheck(geometry.pan_tilt_to_see, inputs)
+
+    @pytest.mark.parametrize(
+        "beyond",
+        [(1.0, 0.0, 1.0), (1.0, 0.0, 0.0), (-3.0, 0.1, 1.0)],
+        ids=["beside", "along the tilt axis", "far beside"],
+    )
+    def test_a_direction_out_of_reach_leaves_the_gradient_of_a_shared_ray_alone(self, beyond):
+        ray = geometry.ray_from_pan_tilt(scalar(0.2), scalar(1.2)).requires_grad_()
+        directions = tensor(*beyond, 0.02, 0.1, 1.0).reshape(2, 3).requires_grad_()
+        pan, tilt = geometry.pan_tilt_to_see(ray, directions)
+        assert pan.isnan().tolist() == tilt.isnan().tolist() == [True, False]
+        (pan + tilt).nan_to_num(0.0).sum().backward()
+        alone = ray.detach().clone().requires_grad_()
+        sum(geometry.pan_tilt_to_see(alone, directions[1].detach())).backward()
+        torch.testing.assert_close(ray.grad, alone.grad)
+        assert alone.grad.abs().max() > 0
+        torch.testing.assert_close(directions.grad[0], torch.zeros(3).double())
+
+    def test_the_edge_of_the_reach_has_a_value_and_a_finite_gradient(self):
+        # Straight below is seen straight ahead by a camera that looks straight down.
+        ray = tensor(0.0, 1.0, 0.0, grad=True)
+        pan, tilt = geometry.pan_tilt_to_see(ray, tensor(0.0, 0.0, 1.0))
+        torch.testing.assert_close(tilt.detach(), scalar(math.pi / 2))
+        assert pan.isfinite()
+        (pan + tilt).backward()
+        assert bool(ray.grad.isfinite().all())

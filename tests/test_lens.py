@@ -2,6 +2,7 @@
 
 import json
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -319,6 +320,15 @@ class TestStorage:
         loaded = RadialLens.load(path)
         for name, value in lens.as_dict().items():
             assert loaded.as_dict()[name] == value
+
+    def test_a_failed_write_leaves_the_old_lens(self, tmp_path, monkeypatch):
+        path = tmp_path / "lens.json"
+        strong().save(path)
+        before = path.read_bytes()
+        monkeypatch.setattr("torchptz.files.os.replace", Mock(side_effect=OSError("no space left")))
+        with pytest.raises(OSError, match="no space"):
+            strong()[0].save(path)
+        assert path.read_bytes() == before
 
     @pytest.mark.parametrize(
         ("change", "words"),

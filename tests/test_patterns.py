@@ -98,6 +98,29 @@ class TestRoundTrips:
         for lines, expected in zip(cut.to_lists(), points[start:stop], strict=True):
             assert [line.tolist() for line in lines] == [line.tolist() for line in expected]
 
+    def test_a_failed_write_leaves_the_old_file(self, tmp_path, monkeypatch):
+        path = tmp_path / "patterns.npz"
+        LinePatterns.from_lists(LISTED[0], SIZE).save(path)
+        before = path.read_bytes()
+
+        def half(file, **_):
+            file.write(b"PK")
+            raise OSError("no space left")
+
+        monkeypatch.setattr(np, "savez_compressed", half)
+        with pytest.raises(OSError, match="no space"):
+            LinePatterns.from_lists(LISTED[0][:1], SIZE).save(path)
+        assert path.read_bytes() == before
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_without_offsets_all_else_stays(self):
+        whole = LinePatterns.from_lists(LISTED[0], SIZE, LISTED[1], LISTED[2])
+        bare = whole.without_offsets()
+        assert bare.offsets is None
+        for name in ("points", "mask", "image_size", "sigma"):
+            assert torch.equal(getattr(bare, name), getattr(whole, name))
+        assert whole.offsets is not None
+
     @given(first=shapes, second=shapes)
     @settings(max_examples=25, deadline=None)
     def test_stack_is_the_batch_of_all_lists(self, first, second):

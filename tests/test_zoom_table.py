@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import fields
 from enum import Enum
 
 import numpy as np
@@ -15,6 +16,7 @@ from torchptz.zoom_table import Knot, ZoomTable
 
 SIZE = [640, 480]
 ZOOMS = [1.0, 2.0, 8.0]
+NOMINAL = [1.0, 2.1, 8.1]
 UNITS = [0.0, 3000.0, 9000.0]
 CENTERS = [[310.0, 250.0], [320.0, 245.0], [322.0, 240.0]]
 COEFFICIENTS = [[-0.1, 0.02], [-0.04, 0.01], [0.0, 0.002]]
@@ -34,6 +36,7 @@ def full_table(**options):
         lenses(),
         ZOOMS,
         camera="north",
+        nominal_zoom=NOMINAL,
         zoom_units=UNITS,
         rms_px=torch.tensor([0.1, 0.2, 0.3]),
         gain=[1.01, 1.02, math.nan],
@@ -99,7 +102,7 @@ class TestInterpolation:
 
 
 class TestRange:
-    @pytest.mark.parametrize("zoom", [0.9, 8.1, [2.0, 8.1], torch.tensor(8.1)])
+    @pytest.mark.parametrize("zoom", [0.9, 8.3, [2.0, 8.3], torch.tensor(8.3)])
     def test_beyond_the_knots_is_refused_with_a_way_out(self, zoom):
         with pytest.raises(ValueError, match=r"north: zoom .* 1 to 8; .*extrapolate=True"):
             full_table().at(zoom)
@@ -108,15 +111,29 @@ class TestRange:
         held = full_table().at([0.5, 2.0, 20.0], extrapolate=True)
         assert_same_lens(held, lenses(), rtol=0, atol=0)
 
-    def test_rounding_is_not_beyond(self):
-        assert_same_lens(
-            full_table().at([1 - 1e-7, 2.0, 8 * (1 + 1e-7)]), lenses(), rtol=1e-6, atol=0
-        )
+    def test_two_percent_beyond_the_ends_their_lens_is_held(self):
+        table = full_table()
+        assert_same_lens(table.at([1 / 1.02, 2.0, 8 * 1.02]), lenses(), rtol=0, atol=0)
+        for zoom in (1 / 1.021, 8 * 1.021):
+            with pytest.raises(ValueError, match="outside the calibrated range"):
+                table.at(zoom)
+
+    @pytest.mark.parametrize("measured", [11.8, 11.97, 11.985, 12.0])
+    def test_a_table_answers_for_the_nominal_zoom_it_ends_at(self, measured):
+        table = ZoomTable.from_lens(lenses(), [1.0, 2.0, measured], nominal_zoom=[1, 2, 12])
+        assert_same_lens(table.at(12), lenses()[2], rtol=0, atol=0)
+
+    def test_a_nominal_zoom_measured_far_from_it_is_explained(self):
+        table = ZoomTable.from_lens(lenses()[:2], [1.0, 1.885], nominal_zoom=[1, 2])
+        with pytest.raises(ValueError, match=r"nominal 2 was measured as 1\.885: ask for that"):
+            table.at(2)
+        with pytest.raises(ValueError, match=r"range 1 to 1\.885; calibrate"):
+            table.at(3)
 
     def test_a_single_knot_answers_for_its_zoom_only(self):
         table = ZoomTable.from_lens(lenses()[1], [2.0])
         assert_same_lens(table.at(2.0), lenses()[1], rtol=0, atol=0)
-        assert_same_lens(table.at(2.0 * (1 + 5e-7)), lenses()[1], rtol=0, atol=0)
+        assert_same_lens(table.at(2.0 * 1.015), lenses()[1], rtol=0, atol=0)
         with pytest.raises(ValueError, match=r"zoom 2\.1 is outside the calibrated range 2 to 2"):
             table.at(2.1)
         assert_same_lens(table.at(7.0, extrapolate=True), lenses()[1], rtol=0, atol=0)
@@ -214,15 +231,38 @@ class TestFile:
         for one, other in zip(loaded.knots, table.knots, strict=True):
             assert_same_lens(one.lens, other.lens, rtol=0, atol=0)
             torch.testing.assert_close(one.covariance, other.covariance, rtol=0, atol=0)
-            for name in (
-                *("zoom", "status", "usable", "zoom_units", "rms_px", "gain", "gain_sigma"),
-                *("focal_length_px", "focal_length_sigma_px", "points", "lines"),
-            ):
-                assert getattr(one, name) == getattr(other, name), name
+            for field in fields(Knot):
+                if field.name not in ("lens", "covariance"):
+                    name = field.name
+                    assert getattr(one, name) == getattr(other, name), name
         assert loaded.knots[2].gain is None  # NaN is no JSON
         assert loaded.knots[0].gain == 1.01
         loaded.save(tmp_path / "again.json")
         assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+    def test_what_was_not_estimated_stays_known_to_be_unknown(self, tmp_path):
+        """A centre that was kept has no covariance; the coefficients have."""
+        covariance = torch.eye(4).double() * 0.25
+        covariance[0, 0] = covariance[1, 1] = math.inf
+        path = tmp_path / "table.json"
+        ZoomTable.from_lens(lenses()[0], [1.0], covariance=covariance[None]).save(path)
+        stored = json.loads(path.read_text(), parse_constant=pytest.fail)
+        assert stored["knots"][0]["covariance"][:2] == [[None, 0, 0, 0], [0, None, 0, 0]]
+        assert torch.equal(ZoomTable.load(path).knots[0].covariance, covariance)
+
+    def test_an_interrupted_write_leaves_the_old_table(self, tmp_path, monkeypatch):
+        path = tmp_path / "table.json"
+        full_table().save(path)
+        before = path.read_bytes()
+
+        def full_disk(*_):
+            raise OSError("no space left")
+
+        monkeypatch.setattr("torchptz.files.os.replace", full_disk)
+        with pytest.raises(OSError, match="no space"):
+            full_table(status=["OK", "X", "OK"]).save(path)
+        assert path.read_bytes() == before
+        assert [one.name for one in tmp_path.iterdir()] == ["table.json"]
 
     def test_a_few_lines_of_json_and_numpy_undistort_a_point(self, tmp_path):
         full_table().save(tmp_path / "table.json")
@@ -295,6 +335,9 @@ class TestRefusedFiles:
             ("coefficients", [math.nan, 0], "knots[1].coefficients must be a list of 2 finite"),
             ("coefficients", [1], "knots[1].coefficients must be a list of 2 finite numbers"),
             ("covariance", [[1]], "knots[1].covariance must be a list of 4x4 finite numbers"),
+            ("covariance", [None] * 4, "knots[1].covariance must be a list of 4x4 finite"),
+            ("covariance", [[math.nan] * 4] * 4, "knots[1].covariance must be a list of 4x4"),
+            ("nominal_zoom", -1, "knots[1]: zoom 2: nominal_zoom must be a positive magnif"),
             ("rms_px", "small", "knots[1].rms_px must be a finite number, not 'small'"),
             ("usable", "yes", "knots[1].usable must be true or false, not 'yes'"),
             ("status", None, "knots[1].status must be a text, not None"),

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import click
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -92,37 +93,63 @@ def main(verbose: int) -> None:
 @click.option("--out", "-o", type=_OUT, required=True, help="Folder of the run.")
 @click.option("--board", help="Inner corners of the photographed chessboard, such as 9x6.")
 @click.option("--name", help="Name of the camera; default the folder's or the file's.")
-def collect(source: Path, out: Path, board: str | None, name: str | None) -> None:
+@click.option(
+    "--zoom", type=float, show_default="1", help="Magnification of the photographs; 1 = widest."
+)
+@click.option(
+    "--pixel-aspect", type=float, show_default="1", help="Width over height of a pixel in them."
+)
+def collect(
+    source: Path,
+    out: Path,
+    board: str | None,
+    name: str | None,
+    zoom: float | None,
+    pixel_aspect: float | None,
+) -> None:
     """Collect line patterns from SOURCE.
 
     SOURCE is a fleet's configuration (.yaml), a folder of chessboard photographs of one camera, or
-    a set of measured lines (.npz).
+    a set of measured lines (.npz). A configuration names its cameras, zooms and pixel aspects
+    itself: --board, --name, --zoom and --pixel-aspect go with the others.
     """
     if source.suffix.lower() in _CONFIG_SUFFIXES and source.is_file():
-        _refuse("--board and --name go with photographs", board, name)
+        _refuse(
+            "--board, --name, --zoom and --pixel-aspect go with photographs; a configuration says "
+            "them itself",
+            *(board, name, zoom, pixel_aspect),
+        )
         _collect_fleet(source, out)
         return
     _quiet_decoders()
     from torchptz.fleet.photographs import collect_line_set, collect_photographs, parse_board
 
+    optics = {
+        "magnification": 1.0 if zoom is None else zoom,
+        "pixel_aspect": 1.0 if pixel_aspect is None else pixel_aspect,
+    }
     if source.is_dir():
         if board is None:
             raise click.UsageError("photographs need --board, the inner corners, such as 9x6")
         with _counting("photographs") as progress:
-            found = collect_photographs(source, out, parse_board(board), name, progress)
+            found = collect_photographs(source, out, parse_board(board), name, progress, **optics)
         for photograph, reason in found.skipped.items():
             click.echo(f"skipped: {photograph} {reason}", err=True)
-        click.echo(f"{len(found.used)} of {len(found.used) + len(found.skipped)} photographs used")
+        for photograph, reason in found.unreadable.items():
+            click.echo(f"failed: {photograph} {reason}", err=True)
+        total = len(found.used) + len(found.skipped) + len(found.unreadable)
+        click.echo(f"{len(found.used)} of {total} photographs used")
     elif source.suffix.lower() == ".npz":
         _refuse("--board goes with photographs", board)
-        found = collect_line_set(source, out, name)
+        found = collect_line_set(source, out, name, **optics)
     else:
         raise click.UsageError(
             f"{source}: neither a configuration (.yaml), nor a folder of photographs, nor a set of "
             "lines (.npz)"
         )
-    zoom = found.record.zooms[0]
-    click.echo(f"{found.folder}: {zoom.lines} lines, {zoom.points} points")
+    pattern = found.record.zooms[0]
+    click.echo(f"{found.folder}: {pattern.lines} lines, {pattern.points} points")
+    _exit(all_ok=not found.unreadable, none_ok=False)
 
 
 def _collect_fleet(config: Path, out: Path) -> None:
@@ -170,7 +197,13 @@ def calibrate(config: Path, out: Path, powers: tuple[float, ...]) -> None:
 @click.argument("table", type=_FILE)
 @click.argument("pictures", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", "-o", type=_OUT, required=True, help="Folder for the rectified pictures.")
-@click.option("--zoom", type=float, help="Magnification of the pictures; 1 = widest.")
+@click.option(
+    "--zoom",
+    type=float,
+    help="Magnification of the pictures, 1 = widest: the measured one, not the nominal one that "
+    "the camera was sent to. The table has both, as zoom and nominal_zoom; up to 2 % beyond its "
+    "ends it holds its outermost lens.",
+)
 @click.option("--zoom-units", type=float, help="Or their zoom in the camera's own units.")
 @click.option(
     "--canvas",
@@ -221,7 +254,7 @@ def rectify(
 )
 def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
     """Serve the simulated cameras of CONFIG until interrupted."""
-    from torchptz.fleet.records import write_whole
+    from torchptz.files import write_whole
     from torchptz.simulation import serve
 
     def announce(addresses: dict[str, str]) -> None:
@@ -239,25 +272,9 @@ def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
 
 
 def _print_summary(summary, run: Path) -> None:
-    table = Table(title=f"Lenses of {run}", title_justify="left")
-    for heading in ("camera", "zoom", "units", "status", "rms px", "gain", "centre", "points"):
-        table.add_column(heading, justify="left" if heading in ("camera", "status") else "right")
-    for name, camera in summary.cameras.items():
-        for zoom in camera.zooms:
-            table.add_row(
-                name,
-                f"{zoom.magnification:.4g}",
-                "" if zoom.zoom_units is None else f"{zoom.zoom_units:g}",
-                "failed" if zoom.status is None else zoom.status.lower().replace("_", " "),
-                "" if zoom.rms_px is None else f"{zoom.rms_px:.3f}",
-                "" if zoom.gain is None else f"{zoom.gain:.3f} ± {zoom.gain_sigma or 0:.3f}",
-                "" if zoom.center is None else f"{zoom.center[0]:.1f}, {zoom.center[1]:.1f}",
-                str(zoom.points),
-            )
-        if not camera.zooms:
-            table.add_row(name, "", "", "failed", "", "", "", "0")
-    # In a file or a pipe there is no terminal whose width would be a reason to break lines.
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    # In a file or a pipe there is no terminal whose width would be a reason to cut rows.
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    console.print(_summary_table(summary, f"Lenses of {run}"))
     for name, camera in summary.cameras.items():
         if camera.error is not None:
             click.echo(f"{name}: {_one_line(camera.error)}", err=True)
@@ -266,10 +283,44 @@ def _print_summary(summary, run: Path) -> None:
                 click.echo(f"{name}, zoom {zoom.magnification:.4g}: {zoom.error}", err=True)
 
 
+def _summary_table(summary, title: str) -> Table:
+    """A row a zoom, of one line on 80 columns."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    # Where that is too narrow, a long name is cut and no number.
+    table.add_column("camera", overflow="ellipsis")
+    for heading in ("zoom", "status", "rms px", "gain", "centre", "points"):
+        table.add_column(heading, justify="left" if heading == "status" else "right", no_wrap=True)
+    for name, camera in summary.cameras.items():
+        for zoom in camera.zooms:
+            sigma = "" if zoom.gain_sigma is None else f"±{zoom.gain_sigma:.3f}"
+            table.add_row(
+                name,
+                f"{zoom.magnification:.4g}",
+                _short(zoom.status),
+                "" if zoom.rms_px is None else f"{zoom.rms_px:.3f}",
+                "" if zoom.gain is None else f"{zoom.gain:.3f}{sigma}",
+                "" if zoom.center is None else f"{zoom.center[0]:.1f},{zoom.center[1]:.1f}",
+                str(zoom.points),
+            )
+        if not camera.zooms:
+            table.add_row(name, "", _short(None), "", "", "", "0")
+    return table
+
+
+def _short(status: str | None) -> str:
+    """A fit's status in a table; the sentence that explains it stands below."""
+    return "failed" if status is None else status.lower().replace("_", " ")
+
+
 @contextmanager
 def _fleet_progress() -> Iterator[Callable[[str, str, int, int], None]]:
-    """One bar a camera; called from the cameras' threads."""
+    """One bar a camera, or a line for everything it begins; called from the cameras' threads."""
+    from torchptz.fleet.progress import Stages
+
     with _bars() as bars:
+        if bars.disable:
+            yield Stages(lambda line: click.echo(line, err=True))
+            return
         tasks: dict[str, int] = {}
 
         def progress(camera: str, what: str, done: int, total: int) -> None:

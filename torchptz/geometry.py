@@ -100,10 +100,15 @@ def pan_tilt_from_ray(rays: Tensor) -> tuple[Tensor, Tensor]:
         rays: (..., 3), any length.
 
     Returns:
-        pan in [-pi, pi] and tilt in [-pi/2, pi/2], (...) radians; the pan of the poles is 0.
+        pan in [-pi, pi] and tilt in [-pi/2, pi/2], (...) radians; the pan of the poles is 0, and
+        there neither angle has a gradient along x and z.
     """
     x, y, z = rays.unbind(-1)
-    return torch.atan2(-x, z), torch.atan2(y, torch.hypot(x, z))
+    pole = (x == 0) & (z == 0)
+    # The inner where keeps the gradient of the poles finite: neither angle has one there.
+    level = torch.where(pole, torch.ones_like(z), z)
+    height = torch.where(pole, torch.zeros_like(z), torch.hypot(x, level))
+    return torch.where(pole, torch.zeros_like(x), torch.atan2(-x, level)), torch.atan2(y, height)
 
 
 def pan_tilt_to_see(rays: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
@@ -123,13 +128,23 @@ def pan_tilt_to_see(rays: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
     ray = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     seen = directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
     x, y, z = seen.unbind(-1)
+    # The inner wheres here and below keep the gradients of what is out of reach, and of the edge
+    # of the reach, finite; the outer ones at the end make NaN of it.
+    on_axis = (y == 0) & (z == 0)
+    z = torch.where(on_axis, torch.ones_like(z), z)
     # y cos t + z sin t = P_y
-    phase, half = torch.atan2(z, y), torch.acos(ray[..., 1] / torch.hypot(y, z))
+    ratio = ray[..., 1] / torch.hypot(y, z)
+    reachable = (ratio.abs() <= 1) & ~on_axis
+    inside = ratio.abs() < 1
+    half = torch.acos(torch.where(inside, ratio, torch.zeros_like(ratio)))
+    half = torch.where(inside, half, torch.acos(ratio.detach().clamp(-1, 1)))
+    phase = torch.atan2(z, y)
     first, second = wrap_angle(phase + half), wrap_angle(phase - half)
     tilt = torch.where(first.abs() <= second.abs(), first, second)
     depth = z * torch.cos(tilt) - y * torch.sin(tilt)
-    pan = torch.atan2(x, depth) - torch.atan2(ray[..., 0], ray[..., 2])
-    return wrap_angle(pan), tilt
+    pan = wrap_angle(_atan2(x, depth) - _atan2(ray[..., 0], ray[..., 2]))
+    nowhere = torch.full_like(pan, math.nan)
+    return torch.where(reachable, pan, nowhere), torch.where(reachable, tilt, nowhere)
 
 
 def ray_through_pixel(pan: Tensor, tilt: Tensor, displacement: Tensor) -> Tensor:
@@ -142,8 +157,8 @@ def ray_through_pixel(pan: Tensor, tilt: Tensor, displacement: Tensor) -> Tensor
     Returns:
         (..., 3) unit vector.
 
-    Source: paper, section 4.11: the displacement correction that makes a ray read at the longest
-    zoom good to a small part of the head's quantum.
+    This displacement correction makes a ray read at the longest zoom good to a small part of the
+    head's quantum.
     """
     seen = torch.cat([displacement, torch.ones_like(displacement[..., :1])], -1)
     seen = seen / torch.linalg.vector_norm(seen, dim=-1, keepdim=True)
@@ -185,34 +200,6 @@ def line_plane(line: Tensor, focal_length: Tensor, principal_point: Tensor) -> T
     return plane / torch.linalg.vector_norm(plane, dim=-1, keepdim=True)
 
 
-def tilt_on_plane(plane: Tensor, ray: Tensor, pan: Tensor) -> tuple[Tensor, Tensor]:
-    """Both tilts at which a ray lies in a camera-frame plane, for a given pan.
-
-    ``B' . R_t R_p P = 0`` reads ``A cos t + B sin t = C`` for a given pan.
-
-    Args:
-        plane: (..., 3) ``B'``.
-        ray: (..., 3) ``P``.
-        pan: (...) radians.
-
-    Returns:
-        Two tensors (...) of radians in [-pi, pi], NaN where no tilt reaches the plane.
-
-    Source: paper, section 1.
-    """
-    turned = (pan_rotation(pan) @ ray.unsqueeze(-1)).squeeze(-1)
-    b1, b2, b3 = plane.unbind(-1)
-    x, y, z = turned.unbind(-1)
-    a, b, c = b2 * y + b3 * z, b3 * y - b2 * z, -b1 * x
-    reach = torch.hypot(a, b)
-    reachable = (c.abs() <= reach) & (reach > 0)
-    # The inner wheres keep the gradient of planes out of reach finite.
-    ratio = torch.where(reachable, c / torch.where(reachable, reach, 1.0), 0.0)
-    phase = torch.atan2(b, a)
-    half = torch.where(reachable, torch.acos(ratio), math.nan)
-    return wrap_angle(phase + half), wrap_angle(phase - half)
-
-
 def wrap_angle(angle: Tensor) -> Tensor:
     """The same angle in [-pi, pi]: differences of pan live on the circle.
 
@@ -220,6 +207,11 @@ def wrap_angle(angle: Tensor) -> Tensor:
         angle: (...) radians.
     """
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def _atan2(y: Tensor, x: Tensor) -> Tensor:
+    """atan2 with a finite gradient at (0, 0), where it is 0."""
+    return torch.atan2(y, torch.where((x == 0) & (y == 0), torch.ones_like(x), x))
 
 
 def _matrix(rows: list[list[Tensor]]) -> Tensor:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.files import write_whole
 
 SCHEMA = "torchptz.lens"
 SCHEMA_VERSION = 1
@@ -43,7 +44,7 @@ class RadialLens(Batched):
         ValueError: shapes that do not fit together, powers that are not positive and increasing,
             a scale or aspect that is not positive.
 
-    Everything is kept in float64. Source: paper, section 2, and 4.1 for the unit of r.
+    Everything is kept in float64. Source: paper, section 2; the paper does not say the unit of r.
     """
 
     center: Tensor
@@ -205,8 +206,8 @@ class RadialLens(Batched):
             raise ValueError(f"stored lens holds something else than numbers ({error})") from error
 
     def save(self, path: str | Path) -> None:
-        """Write the lens as JSON."""
-        Path(path).write_text(json.dumps(self.as_dict(), indent=2) + "\n")
+        """Write the lens as JSON; a reader sees the old file or the new one."""
+        write_whole(path, json.dumps(self.as_dict(), indent=2) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> RadialLens:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.files import read_arrays, whole_file
 
 SCHEMA_VERSION = 1
 _FEWEST_POINTS = 3
-# What numpy raises for another file, a cut one and a damaged one.
-_UNREADABLE = (KeyError, TypeError, ValueError, OSError, EOFError, BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +26,8 @@ class LinePatterns(Batched):
         mask: (B, L, P) bool, True where a point is.
         image_size: (B, 2) width and height in px.
         offsets: (B, L, P, 2) or None: how far beside its line each feature was known to be,
-            ``f_assumed (x_read - x_asked)``, undistorted px (paper, section 4.10).
+            ``f_assumed (x_read - x_asked)``, undistorted px: a head stops where its quantum lets
+            it, and its reading says where that is.
         sigma: (B, L, P) or None: standard deviation of a point per coordinate, px; 1 where the
             mask is False.
 
@@ -113,11 +111,11 @@ class LinePatterns(Batched):
 
     def to_lists(self) -> list[list[np.ndarray]]:
         """The points as B lists of (n, 2) arrays, empty lines left out."""
-        points, mask = self.points.cpu().numpy(), self.mask.cpu().numpy()
-        return [
-            [line[keep] for line, keep in zip(*item, strict=True) if keep.any()]
-            for item in zip(points, mask, strict=True)
-        ]
+        return _lists(self.points, self.mask)
+
+    def without_offsets(self) -> LinePatterns:
+        """The same batch as if nothing were known of where the head truly stopped."""
+        return replace(self, offsets=None)
 
     @classmethod
     def stack(cls, patterns: Sequence[LinePatterns]) -> LinePatterns:
@@ -152,13 +150,13 @@ class LinePatterns(Batched):
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the batch as NPZ, without pickles."""
+        """Write the batch as NPZ, without pickles; a reader sees the old file or the new one."""
         arrays = {
             field.name: getattr(self, field.name).cpu().numpy()
             for field in fields(self)
             if getattr(self, field.name) is not None
         }
-        with open(path, "wb") as file:  # a name given to numpy would grow a second ending
+        with whole_file(path) as file:  # a name given to numpy would grow a second ending
             np.savez_compressed(file, schema_version=np.int64(SCHEMA_VERSION), **arrays)
 
     @classmethod
@@ -168,15 +166,11 @@ class LinePatterns(Batched):
         Raises:
             ValueError: not such a file, or one of a later version; names the file.
         """
-        try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
-            version = int(arrays.pop("schema_version"))
-        except FileNotFoundError:
-            raise
-        except _UNREADABLE as error:
-            raise ValueError(f"{path}: not a file of line patterns ({error})") from error
-        if version != SCHEMA_VERSION:
+        arrays = read_arrays(path, "a file of line patterns")
+        version = arrays.pop("schema_version", None)
+        if version is None:
+            raise ValueError(f"{path}: not a file of line patterns (no schema_version)")
+        if not np.array_equal(version, SCHEMA_VERSION):
             raise ValueError(
                 f"{path}: schema version {version}; this torchptz reads {SCHEMA_VERSION}"
             )
@@ -258,7 +252,8 @@ def _array(values: object, where: str) -> np.ndarray:
 
 
 def _lists(values: Tensor, mask: Tensor) -> list[list[np.ndarray]]:
+    """Values (B, L, P, ...) under a mask (B, L, P) as B lists of (n, ...), empty lines left out."""
     return [
         [line[keep] for line, keep in zip(*item, strict=True) if keep.any()]
-        for item in zip(values.numpy(), mask.numpy(), strict=True)
+        for item in zip(values.cpu().numpy(), mask.cpu().numpy(), strict=True)
     ]

@@ -18,6 +18,9 @@ from torchptz.zoom_table_file import read_table, write_table
 
 # Magnifications that differ by less than this part are the same one.
 _SAME_ZOOM = 1e-6
+# Knots lie at measured magnifications, a little off the nominal ones that people ask for. So little
+# beyond the outermost knot, its lens still holds.
+_BEYOND = 0.02
 _ESTIMATED = ("rms_px", "gain", "gain_sigma", "focal_length_px", "focal_length_sigma_px")
 
 
@@ -32,15 +35,17 @@ def _created_by() -> str:
 class Knot:
     """What is known about the lens at one zoom; None where something is not known."""
 
-    zoom: float  # magnification, 1 = widest
+    zoom: float  # magnification as measured, 1 = widest
     lens: RadialLens | None  # batch of one
     status: str = "OK"  # name of the fit's status
     usable: bool | None = None  # whether `ZoomTable.at` may use it; default: status is OK
+    nominal_zoom: float | None = None  # magnification that was asked for
     zoom_units: float | None = None  # the device's own
     rms_px: float | None = None  # px, distance of the points from their lines
     gain: float | None = None  # of the offsets
     gain_sigma: float | None = None
-    covariance: Tensor | None = None  # (2+K, 2+K), order (cx px, cy px, coefficients)
+    # (2+K, 2+K), order (cx px, cy px, coefficients); inf on the diagonal of what is not known
+    covariance: Tensor | None = None
     focal_length_px: float | None = None  # px
     focal_length_sigma_px: float | None = None  # px
     points: int | None = None  # how many the fit saw
@@ -55,10 +60,14 @@ class Knot:
         usable = self.status == "OK" if self.usable is None else bool(self.usable)
         object.__setattr__(self, "usable", usable)
         # Not finite is an estimate's way to say "not known".
-        for name in ("zoom_units", *_ESTIMATED):
+        for name in ("nominal_zoom", "zoom_units", *_ESTIMATED):
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 object.__setattr__(self, name, None)
+        if self.nominal_zoom is not None and not self.nominal_zoom > 0:
+            raise ValueError(
+                f"{where}: nominal_zoom must be a positive magnification, not {self.nominal_zoom}"
+            )
         if self.lens is not None and not _is_finite(self.lens.center, self.lens.coefficients):
             object.__setattr__(self, "lens", None)
         if self.lens is None:
@@ -75,7 +84,8 @@ class Knot:
                     f"{where}: covariance must have shape {(size, size)}, "
                     f"not {tuple(covariance.shape)}"
                 )
-            object.__setattr__(self, "covariance", covariance if _is_finite(covariance) else None)
+            known = not bool((covariance.isnan() | covariance.isneginf()).any())
+            object.__setattr__(self, "covariance", covariance if known else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +93,12 @@ class ZoomTable:
     """The lens of one camera at any zoom between its knots.
 
     Every knot is kept, those of failed fits too; `zooms`, `lens` and `at` see the usable ones.
+    All magnifications are measured ones, but for a knot's ``nominal_zoom``: a camera that is sent
+    to its nominal 2x may truly be at 1.9x.
 
     Args:
         camera: its name.
-        knots: by ascending magnification.
+        knots: by ascending measured magnification.
         principal_point: (2,) px, or None.
         principal_point_covariance: (2, 2) px^2, or None.
         created_by: program and version that made the table.
@@ -140,7 +152,7 @@ class ZoomTable:
 
         Args:
             lens: batch over the zooms.
-            zooms: (B,) magnifications, in any order.
+            zooms: (B,) measured magnifications, in any order.
             camera: its name.
             status: (B,) `Status` or text; default all OK.
             principal_point, principal_point_covariance: of the whole table.
@@ -159,7 +171,7 @@ class ZoomTable:
             if len(values) != len(lens):
                 raise ValueError(f"{camera}: {len(values)} {name} for {len(lens)} lenses")
         knots = [
-            Knot(zoom, lens[i], **{name: _plain(values[i]) for name, values in columns.items()})
+            Knot(zoom, lens[i], **{name: _number(values[i]) for name, values in columns.items()})
             for i, zoom in enumerate(zooms)
         ]
         return cls(
@@ -176,7 +188,7 @@ class ZoomTable:
 
     @property
     def zooms(self) -> list[float]:
-        """Magnifications of the usable knots, ascending."""
+        """Measured magnifications of the usable knots, ascending."""
         return [knot.zoom for knot in self.usable]
 
     @property
@@ -203,21 +215,25 @@ class ZoomTable:
         )
 
     def at(self, zoom: float | Sequence[float] | Tensor, extrapolate: bool = False) -> RadialLens:
-        """The lens at a magnification.
+        """The lens at a measured magnification.
 
         Coefficients and centre run linearly with the logarithm of the magnification, so that
-        ``r L(r)`` is monotonic between two knots wherever it is at both.
+        ``r L(r)`` is monotonic between two knots wherever it is at both. Up to 2 % beyond the knots
+        the lens of the outermost one is held: a camera asked for 12x may have been measured at
+        11.97x, and a table must answer for its own ends.
 
         Args:
-            zoom: a number for a batch of one, or (B,); 1 = widest. Differentiable.
-            extrapolate: beyond the knots, hold the lens of the outermost knot. Holding cannot
-                make up a distortion that nobody has measured, continuing a line can.
+            zoom: a number for a batch of one, or (B,); 1 = widest. Differentiable. Who knows
+                only the nominal magnification finds the measured one in ``knots``, or asks by
+                the device's units.
+            extrapolate: farther beyond the knots, hold the lens of the outermost knot. Holding
+                cannot make up a distortion that nobody has measured, continuing a line can.
 
         Returns:
             A batch of one or B lenses, on the device of ``zoom``.
 
         Raises:
-            ValueError: no usable knot, not a magnification, or beyond the knots.
+            ValueError: no usable knot, not a magnification, or more than 2 % beyond the knots.
         """
         lens = self.lens
         zoom = torch.atleast_1d(torch.as_tensor(zoom, dtype=torch.float64))
@@ -229,12 +245,14 @@ class ZoomTable:
         lens = lens.to(zoom.device)
         knots = torch.tensor(self.zooms, dtype=torch.float64, device=zoom.device).log()
         where = zoom.log()
-        beyond = (where < knots[0] - _SAME_ZOOM) | (where > knots[-1] + _SAME_ZOOM)
+        slack = math.log1p(_BEYOND) + _SAME_ZOOM
+        beyond = (where < knots[0] - slack) | (where > knots[-1] + slack)
         if not extrapolate and bool(beyond.any()):
+            asked = zoom[beyond][0].item()
             raise ValueError(
-                f"{self.camera}: zoom {zoom[beyond][0].item():g} is outside the calibrated range "
-                f"{self.zooms[0]:g} to {self.zooms[-1]:g}; calibrate there too, or ask with "
-                "extrapolate=True for the lens of the nearest knot"
+                f"{self.camera}: zoom {asked:g} is outside the calibrated range "
+                f"{self.zooms[0]:g} to {self.zooms[-1]:g}{self._if_nominal(asked)}; calibrate "
+                "there too, or ask with extrapolate=True for the lens of the nearest knot"
             )
         below, above, weight = _between(knots, where)
         return RadialLens(
@@ -298,6 +316,12 @@ class ZoomTable:
         """
         return read_table(path, cls, Knot)
 
+    def _if_nominal(self, zoom: float) -> str:
+        for knot in self.usable:
+            if knot.nominal_zoom is not None and math.isclose(knot.nominal_zoom, zoom):
+                return f" (the nominal {zoom:g} was measured as {knot.zoom:g}: ask for that)"
+        return ""
+
     def _check_lenses(self) -> None:
         known = [knot for knot in self.knots if knot.lens is not None]
         for knot in known[1:]:
@@ -342,6 +366,6 @@ def _status_name(status: object) -> str:
     return status.name if isinstance(status, Enum) else str(status).removeprefix("Status.")
 
 
-def _plain(value: object) -> object:
+def _number(value: object) -> object:
     """Numbers out of tensors and arrays of one; matrices stay."""
     return value.item() if hasattr(value, "item") and value.ndim == 0 else value

@@ -2,7 +2,9 @@
 
 Read by hand, knot ``k`` maps a picture point ``p`` to ``c + L(r) (p - c)`` with ``c`` its
 ``center``, ``L(r) = 1 + sum_i coefficients[i] r ** powers[i]`` and
-``r = hypot(pixel_aspect (x - c_x), y - c_y) / scale``.
+``r = hypot(pixel_aspect (x - c_x), y - c_y) / scale``. ``zoom`` is the measured magnification,
+``nominal_zoom`` the one that was asked for. A null inside of ``covariance`` stands for infinity:
+what was not estimated is not known.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchptz.files import without_nan, write_whole
 from torchptz.lens import RadialLens
 
 if TYPE_CHECKING:
@@ -26,6 +29,7 @@ _MODEL = (
     "(0, 0) is the centre of the top-left pixel"
 )
 _NUMBERS = (
+    "nominal_zoom",
     "zoom_units",
     "rms_px",
     "gain",
@@ -58,13 +62,13 @@ def write_table(table: ZoomTable, path: str | Path) -> None:
                 "usable": knot.usable,
                 "center": None if knot.lens is None else knot.lens.center[0].tolist(),
                 "coefficients": None if knot.lens is None else knot.lens.coefficients[0].tolist(),
-                "covariance": _list(knot.covariance),
+                "covariance": without_nan(_list(knot.covariance)),
                 **{name: getattr(knot, name) for name in (*_NUMBERS, *_COUNTS)},
             }
             for knot in table.knots
         ],
     }
-    Path(path).write_text(_readable(stored) + "\n", encoding="utf-8")
+    write_whole(path, _readable(stored) + "\n")
 
 
 def read_table(path: str | Path, table_type: type[ZoomTable], knot_type: type[Knot]) -> ZoomTable:
@@ -121,7 +125,7 @@ def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot
             "pixel_aspect": _array(stored, "pixel_aspect", "", ()),
         }
         size = 2 + len(powers)
-        covariance = _array(knot, "covariance", where, (size, size), optional=True)
+        covariance = _covariance(knot, where, size)
     numbers = {name: _array(knot, name, where, (), optional=True) for name in _NUMBERS}
     counts = {name: _array(knot, name, where, (), optional=True) for name in _COUNTS}
     status, zoom = _text(knot, "status", where), _array(knot, "zoom", where, ())
@@ -164,6 +168,22 @@ def _array(
         wanted = f"a list of {length} finite numbers" if shape else "a finite number"
         raise ValueError(f"{where}{name} must be {wanted}, not {value!r}")
     return value
+
+
+def _covariance(knot: dict, where: str, size: int) -> object:
+    """As `_array`, with null inside of the matrix for infinity."""
+    value = _field(knot, "covariance", where)
+    if value is None:
+        return None
+    _array({"covariance": _filled(value, 0.0)}, "covariance", where, (size, size))
+    return _filled(value, math.inf)
+
+
+def _filled(value: object, number: float) -> object:
+    """Nested lists with a number in place of every null."""
+    if isinstance(value, list):
+        return [_filled(inner, number) for inner in value]
+    return number if value is None else value
 
 
 def _fits(value: object, shape: tuple[int | None, ...]) -> bool:

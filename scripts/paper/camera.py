@@ -9,53 +9,62 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from simulated_demo import serve
 
-from paper.device import Settings, fleet, photograph, simulation
+from paper.device import Settings, fleet, simulation
+from paper.pictures import draw_collected, photograph_board, undistortion
+from torchptz.cameras import CameraError
 from torchptz.estimation import Fit, estimate
 from torchptz.estimation.fixed_point import iterate, line_variances
 from torchptz.estimation.problem import Problem
 from torchptz.fleet.driver import collect
-from torchptz.fleet.journal import JOURNAL_NAME, read_journal
 from torchptz.fleet.photographs import find_corners
 from torchptz.fleet.records import CameraRecord, ZoomRecord
 from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 from torchptz.rectification import rectify
-from torchptz.report.figures import draw_before_after, draw_pattern, save_figure
-from torchptz.simulation import CameraTruth, SimulationConfig, compare_lens, load_truth
+from torchptz.report.figures import draw_before_after, save_figure
+from torchptz.simulation import (
+    CameraTruth,
+    SimulationConfig,
+    compare_lens,
+    load_truth,
+    serve_in_process,
+)
 
 POWERS = (1, 2, 3)
 Say = Callable[[str], None]
 
 
 def run(settings: Settings, out: Path, say: Say) -> dict:
-    """The experiment; everything collected, and figures 1 and 3, go into ``out``.
+    """The experiment; draws figures 1 and 3 into ``out``, where what is collected is kept too.
 
     Returns:
         Figures measured, as plain data for JSON.
 
     Raises:
-        RuntimeError: the camera failed; says why.
+        RuntimeError: the simulation or the camera failed; says why.
     """
     started = time.perf_counter()
     simulated = simulation()
     name = simulated.cameras[0].name
-    with serve(simulated, out / "truth.json") as addresses:
+    out.mkdir(parents=True, exist_ok=True)
+    # The truth lies beside the run: what is in the run, an estimator may read.
+    run_folder, truth_path = out / "run", out / "truth.json"
+    with serve_in_process(simulated, truth_path) as addresses:
         config = fleet(simulated, addresses, settings)
-        record = collect(config, out, _stages(say))[name]
+        record = collect(config, run_folder, _stages(say))[name]
         if record.error is not None:
-            raise RuntimeError(record.error)
+            raise CameraError(record.error)
+        zoom = record.zooms[0]
+        if zoom.patterns is None:
+            raise CameraError(f"camera {name}: {zoom.error}")
         say("camera: pointing it at the checkerboard")
-        picture = photograph(config.cameras[0], simulated)
+        picture = photograph_board(config.cameras[0], simulated)
     collected = time.perf_counter() - started
-    truth = load_truth(out / "truth.json")[name]
+    truth = load_truth(truth_path)[name]
     say("camera: estimating")
-    zoom = record.zooms[0]
-    patterns = LinePatterns.load(out / name / zoom.patterns)
-    without = LinePatterns(
-        patterns.points, patterns.mask, patterns.image_size, None, patterns.sigma
-    )
+    patterns = LinePatterns.load(run_folder / name / zoom.patterns)
+    without = patterns.without_offsets()
     start = torch.tensor([record.principal_point], dtype=torch.float64)
     fits = {
         "with_offsets": estimate(patterns, POWERS, center=start),
@@ -79,7 +88,8 @@ def run(settings: Settings, out: Path, say: Say) -> dict:
     say("camera: drawing figures 1 and 3")
     lens = fits["with_offsets"].lens
     rectified = rectify(picture, lens)
-    result["board"] = _draw(record, patterns, (picture, rectified), simulated, out)
+    save_figure(draw_collected(run_folder / name), out / "figure1_patterns.png")
+    result["board"] = _draw_board((picture, rectified), simulated, out)
     result["seconds_collecting"] = collected
     result["seconds"] = time.perf_counter() - started
     return result
@@ -156,11 +166,7 @@ def _judge(fit: Fit, patterns: LinePatterns, start: torch.Tensor, truth: CameraT
 
 def _errors(lens: RadialLens, truth: CameraTruth, zoom: ZoomRecord) -> dict:
     """px, distances to the truth; those of the lens are the largest over the picture."""
-
-    def undistort(points: np.ndarray) -> np.ndarray:
-        return lens.undistort(torch.from_numpy(points)[None])[0].numpy()
-
-    errors = compare_lens(truth, undistort, zoom.zoom_units)
+    errors = compare_lens(truth, undistortion(lens), zoom.zoom_units)
     center = lens.center[0].numpy() - truth.centre(zoom.zoom_units)
     return {
         "center_error_px": float(np.linalg.norm(center)),
@@ -175,25 +181,10 @@ def _unweighted(patterns: LinePatterns) -> Problem:
     return Problem.from_patterns(plain, torch.tensor(POWERS, dtype=torch.float64))
 
 
-def _draw(
-    record: CameraRecord,
-    patterns: LinePatterns,
-    pictures: tuple[np.ndarray, np.ndarray],
-    simulated: SimulationConfig,
-    out: Path,
+def _draw_board(
+    pictures: tuple[np.ndarray, np.ndarray], simulated: SimulationConfig, out: Path
 ) -> dict:
-    """Figures 1 and 3; returns how straight the board's rows and columns are in each picture."""
-    tracks: dict[int, list[tuple[float, float]]] = {}
-    for seen in read_journal(out / record.name / JOURNAL_NAME):
-        if seen.purpose == "track" and seen.found:
-            tracks.setdefault(seen.group, []).append(seen.pixel)
-    figure = draw_pattern(
-        [np.array(track) for track in tracks.values()],
-        record.principal_point,
-        patterns.to_lists()[0],
-        record.image_size,
-    )
-    save_figure(figure, out / "figure1_patterns.png")
+    """Figure 3; returns how straight the board's rows and columns are in each picture."""
     columns, rows = simulated.cameras[0].scene.board.squares
     guides, straightness = [], {}
     for key, picture in zip(("before", "after"), pictures, strict=True):

@@ -1,19 +1,12 @@
-"""The simulated Sony SNC-RZ30P of the experiment: its world, its configuration, its photograph."""
+"""The simulated Sony SNC-RZ30P of the experiment: its world and its configuration."""
 
 from __future__ import annotations
 
-import math
 import os
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from torchptz.cameras import Camera, Pose, open_camera
-from torchptz.fleet.config import CameraConfig, FleetConfig, parse_config
-from torchptz.scanning.observation import Observer
-from torchptz.scanning.stillness import pictures_still
+from torchptz.fleet.config import FleetConfig, parse_config
 from torchptz.simulation import SimulationConfig
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "simulated_fleet.yaml"
@@ -28,8 +21,6 @@ BOARD = {
     "roll_deg": 0.0,
 }
 _PASSWORD = "TORCHPTZ_PAPER_PASSWORD"
-_STILL_PX = 0.3
-_MOST_PICTURES = 40
 
 
 @dataclass(frozen=True)
@@ -83,30 +74,3 @@ def fleet(
         },
         "the paper's camera",
     )
-
-
-def photograph(config: CameraConfig, simulated: SimulationConfig) -> np.ndarray:
-    """The checkerboard at the widest zoom, with the head at rest."""
-    board = simulated.cameras[0].scene.board
-    camera: Camera = open_camera(
-        config.dialect,
-        config.name,
-        config.address,
-        config.resolve_credentials(),
-        **config.driver_options(),
-    )
-    try:
-        camera.prepare()
-        can = camera.capabilities
-        pose = can.nearest_reachable(math.radians(board.pan_deg), math.radians(board.tilt_deg))
-        observer = Observer(camera, lambda _: None, threading.Event(), poll_interval_s=0.005)
-        observer.go(Pose(*pose, can.zoom_limits[0]))
-        picture = camera.snapshot()
-        for _ in range(_MOST_PICTURES):
-            last, picture = picture, camera.snapshot()
-            if pictures_still(last, picture, _STILL_PX):
-                return picture
-        raise RuntimeError(f"camera {config.name}: the board's picture does not come to rest")
-    finally:
-        camera.restore()
-        camera.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,13 +21,43 @@ MIDDLE = np.array([319.5, 239.5])
 CENTER = MIDDLE + 18 * np.array([math.cos(-0.97), math.sin(-0.97)])
 FOCAL_LENGTH = 700.0  # px; the paper does not say
 STEPS = 40  # poses on a line across the picture and beyond
-# The paper does not list its lines. These have its number of points, and variances before the
-# correction like its own (largest 7.48, mean 5.71, sd 1.43 px²): seven directions, each once above
-# and once below the middle. Of 37 such sets tried without noise (15 to 30 degrees, other distances)
-# the loop took 8 to 15 iterations, and the lens as it is erred by 0.047 to 0.087 px: this one is
-# among the better ones in both.
-TILT_DEG, NEAREST, FARTHEST, MARGIN = 14.0, 85.0, 190.0, 4.0  # degrees, px, px, px
-_STRIDE = 5  # shuffles the distances over the directions
+MARGIN = 4.0  # px, of the lines' ends from the picture's border
+
+
+@dataclass(frozen=True)
+class Layout:
+    """14 lines at 14 distances from the middle: seven directions, each once above and once below.
+
+    The paper does not list its lines. The default has its number of points, and variances before
+    the correction like its own (largest 7.48, mean 5.71, sd 1.43 px²). How many iterations the loop
+    needs depends on the lines: `family` has more of that kind, to say by how much.
+    """
+
+    tilt_deg: float = 14.0  # directions are within so much of horizontal
+    nearest: float = 85.0  # px, the smallest distance of a line from the middle ...
+    farthest: float = 190.0  # ... and the largest
+    stride: int = 5  # shuffles the distances over the directions
+
+
+def family() -> list[Layout]:
+    """Layouts of the default's kind, itself not among them."""
+    every = [
+        Layout(tilt_deg, nearest, farthest, stride)
+        for tilt_deg in (14.0, 22.0, 30.0)
+        for nearest, farthest in ((85.0, 190.0), (70.0, 200.0))
+        for stride in (1, 3, 5, 9, 11, 13)  # whatever has no divisor in common with 14
+    ]
+    return [one for one in every if one != Layout()]
+
+
+class Truth:
+    """The lens as `compare_lens` asks for it; it has one zoom."""
+
+    image_size = SIZE
+
+    def undistort(self, _zoom_units: float, points: np.ndarray) -> np.ndarray:
+        """(N, 2) px to undistorted px."""
+        return undistort(points)
 
 
 def distort(points: np.ndarray) -> np.ndarray:
@@ -41,15 +73,16 @@ def undistort(points: np.ndarray) -> np.ndarray:
     return CENTER + away * 2 / (1 + np.sqrt(1 + 4 * DISTORTION * radius))
 
 
-def near_horizontal_lines() -> ImageLines:
-    """14 lines at 14 distances from the middle, within TILT_DEG of horizontal."""
+def near_horizontal_lines(layout: Layout = Layout()) -> ImageLines:
+    """The lines of a layout, from border to border."""
     lines, starts, ends = [], [], []
     low, high = np.full(2, MARGIN - 0.5), np.asarray(SIZE) - MARGIN - 0.5
     for i in range(14):
-        angle = math.radians(-TILT_DEG + 2 * TILT_DEG * (i % 7) / 6)
+        angle = math.radians(layout.tilt_deg * ((i % 7) / 3 - 1))
         along = np.array([math.cos(angle), math.sin(angle)])
         normal = (1 if i < 7 else -1) * np.array([-along[1], along[0]])
-        through = MIDDLE + normal * (NEAREST + (FARTHEST - NEAREST) * (_STRIDE * i % 14) / 13)
+        step = (layout.farthest - layout.nearest) / 13
+        through = MIDDLE + normal * (layout.nearest + step * (layout.stride * i % 14))
         with np.errstate(divide="ignore", invalid="ignore"):
             cuts = np.sort(np.stack([(low - through) / along, (high - through) / along]), axis=0)
         enter, leave = np.nanmax(cuts[0]), np.nanmin(cuts[1])
@@ -80,19 +113,15 @@ def scan(lines: ImageLines, steps: int = STEPS) -> list[np.ndarray]:
     return [line[kept] for line, kept in zip(seen, inside, strict=True)]
 
 
-def noisy(lines: list[np.ndarray], sigma: float, seeds: int) -> LinePatterns:
-    """A batch of the pattern, each item with its own white noise of ``sigma`` px."""
-    clean = LinePatterns.from_lists([lines], SIZE)
-    points = clean.points.expand(seeds, -1, -1, -1).clone()
-    for seed in range(seeds):
+def noisy(patterns: Sequence[list[np.ndarray]], sigma: float) -> LinePatterns:
+    """A batch of patterns, each with its own white noise of ``sigma`` px; seeds are the indices."""
+    clean = LinePatterns.from_lists(patterns, SIZE)
+    points = clean.points.clone()
+    for seed in range(len(clean)):
         generator = torch.Generator().manual_seed(seed)
         noise = torch.randn(points.shape[1:], generator=generator, dtype=torch.float64)
-        points[seed] += sigma * noise * clean.mask[0, ..., None]
-    return LinePatterns(
-        points,
-        clean.mask.expand(seeds, -1, -1).clone(),
-        clean.image_size.expand(seeds, -1).clone(),
-    )
+        points[seed] += sigma * noise * clean.mask[seed, ..., None]
+    return replace(clean, points=points)
 
 
 def _double(*values: float) -> Tensor:

@@ -6,7 +6,7 @@ import inspect
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,21 +18,24 @@ from paper.pattern import (
     DISTORTION,
     MIDDLE,
     SIZE,
+    Truth,
+    family,
     near_horizontal_lines,
     noisy,
     scan,
-    undistort,
 )
+from paper.pictures import undistortion
 from torchptz.estimation import estimate
 from torchptz.estimation.fixed_point import FixedPoint, iterate, line_variances
 from torchptz.estimation.problem import Problem
 from torchptz.lens import RadialLens
 from torchptz.report.figures import draw_convergence, draw_correction, save_figure
 from torchptz.scanning.layout import spread_lines
-from torchptz.simulation.comparison import fit_similarity
+from torchptz.simulation import compare_lens
 
 POWERS = (1.0, 2.0, 3.0)
 SIGMAS = (0.0, 0.05, 0.483)  # px; the last one leaves the paper's residual variance
+FAMILY_SIGMAS = (0.0, 0.05)  # px; at more noise the floor is noise, and reached at once
 Say = Callable[[str], None]
 
 
@@ -61,15 +64,24 @@ def run(settings: Settings, out: Path | None, say: Say) -> dict:
     for sigma in SIGMAS:
         say(f"synthetic: noise of {sigma:g} px")
         seeds = settings.seeds if sigma else 1
-        result["noise"][f"{sigma:g}"] = _at_noise(lines, sigma, seeds)
+        result["noise"][f"{sigma:g}"] = _at_noise([lines] * seeds, sigma)
     say(f"synthetic: l0 held at 1, {settings.iterations} iterations")
     result["l0_fixed"], held = _with_l0_fixed(lines, settings.iterations)
-    # How fast the iteration is depends on the lines. With others, some of them near the centre:
+    # How fast the iteration is depends on the lines. With others of this kind:
+    layouts = family()
+    say(f"synthetic: {len(layouts)} other patterns")
+    kin = [scan(near_horizontal_lines(layout)) for layout in layouts]
+    result["family"] = {
+        "layouts": [asdict(layout) for layout in layouts],
+        "points": [sum(map(len, one)) for one in kin],
+        "noise": {f"{sigma:g}": _family_at_noise(kin, sigma) for sigma in FAMILY_SIGMAS},
+    }
+    # And with some of them near the centre:
     other = scan(spread_lines(SIZE, tuple(CENTER), 4, 4, 6, margin=40.0), steps=36)
     result["other_pattern"] = {
         "lines": len(other),
         "points": sum(map(len, other)),
-        **_at_noise(other, 0.05, min(settings.seeds, 8)),
+        **_at_noise([other] * min(settings.seeds, 8), 0.05),
     }
     if out is not None:
         say("synthetic: drawing figure 2")
@@ -78,18 +90,18 @@ def run(settings: Settings, out: Path | None, say: Say) -> dict:
     return result
 
 
-def _at_noise(lines: list[np.ndarray], sigma: float, seeds: int) -> dict:
-    patterns = noisy(lines, sigma, seeds)
+def _at_noise(lines: list[list[np.ndarray]], sigma: float) -> dict:
+    patterns = noisy(lines, sigma)
     problem = Problem.from_patterns(patterns, torch.tensor(POWERS, dtype=torch.float64))
     loop = _iterate(problem)
     history = torch.stack(loop.history)  # (I + 1, B, L)
     lens = _lens(loop.center, loop.coefficients)
     fit = estimate(patterns, [int(p) for p in POWERS], center=_start(problem))
     return {
-        "seeds": list(range(seeds)),
+        "seeds": list(range(len(patterns))),
         "variance_before_px2": _spread(history[0]),
         "variance_after_px2": _spread(history[-1]),
-        **_iterations(history, problem),
+        **_summary(_iterations_to_floor(history, problem)),
         "iterations_to_stop": int(loop.iterations.median()),
         "coefficients": loop.coefficients.median(0).values.tolist(),
         **_errors(lens),
@@ -106,8 +118,29 @@ def _at_noise(lines: list[np.ndarray], sigma: float, seeds: int) -> dict:
     }
 
 
+def _family_at_noise(patterns: list[list[np.ndarray]], sigma: float) -> dict:
+    """How the loop does on many patterns at once."""
+    problem = Problem.from_patterns(
+        noisy(patterns, sigma), torch.tensor(POWERS, dtype=torch.float64)
+    )
+    loop = _iterate(problem)
+    history = torch.stack(loop.history)
+    needed = _iterations_to_floor(history, problem)
+    errors = _each_error(_lens(loop.center, loop.coefficients))
+    return {
+        "variance_before_px2": _spread(history[0]),
+        "iterations_to_floor_each": needed.tolist(),
+        "iterations_to_floor_least": int(needed.min()),
+        "within_ten_iterations": int((needed <= 10).sum()),
+        **_summary(needed),
+        "largest_error_raw_worst_px": max(errors["largest_error_raw_px"]),
+        "largest_error_similarity_worst_px": max(errors["largest_error_similarity_px"]),
+        **_medians(errors),
+    }
+
+
 def _with_l0_fixed(lines: list[np.ndarray], iterations: int) -> tuple[dict, FixedPoint]:
-    problem = Problem.from_patterns(noisy(lines, 0.0, 1), torch.tensor(POWERS, dtype=torch.float64))
+    problem = Problem.from_patterns(noisy([lines], 0.0), torch.tensor(POWERS, dtype=torch.float64))
     floor = float(_mean(_iterate(problem).history[-1], problem))
     held = iterate(
         problem,
@@ -151,13 +184,16 @@ def _mean(variances: Tensor, problem: Problem) -> Tensor:
     return (variances * count).sum(-1) / count.sum(-1)
 
 
-def _iterations(history: Tensor, problem: Problem) -> dict:
-    """After how many iterations the mean variance is within 1 % of where it ends."""
+def _iterations_to_floor(history: Tensor, problem: Problem) -> Tensor:
+    """(B,) after how many iterations the mean variance is within 1 % of where it ends."""
     mean = _mean(history, problem)
-    needed = (mean <= 1.01 * mean[-1]).double().argmax(0)
+    return (mean <= 1.01 * mean[-1]).double().argmax(0)
+
+
+def _summary(iterations: Tensor) -> dict:
     return {
-        "iterations_to_floor": int(needed.double().quantile(0.5, interpolation="higher")),
-        "iterations_to_floor_most": int(needed.max()),
+        "iterations_to_floor": int(iterations.double().quantile(0.5, interpolation="higher")),
+        "iterations_to_floor_most": int(iterations.max()),
     }
 
 
@@ -172,26 +208,22 @@ def _spread(variances: Tensor) -> dict:
 
 def _errors(lens: RadialLens) -> dict:
     """Medians over the items, px: distances to the truth over the picture, corners included."""
-    x, y = np.meshgrid(np.linspace(0, SIZE[0] - 1, 47), np.linspace(0, SIZE[1] - 1, 35))
-    grid = np.stack([x, y], -1).reshape(-1, 2)
-    truth = undistort(grid)
-    raw, similar = [], []
-    for estimated in lens.undistort(torch.from_numpy(grid)[None]).numpy():
-        if not np.isfinite(estimated).all():  # the lens folds inside the picture
-            raw.append(math.inf)
-            similar.append(math.inf)
-            continue
-        scale, turn, shift = fit_similarity(estimated, truth)
-        raw.append(np.linalg.norm(estimated - truth, axis=1).max())
-        aligned = scale * estimated @ turn.T + shift
-        similar.append(np.linalg.norm(aligned - truth, axis=1).max())
+    return _medians(_each_error(lens))
+
+
+def _each_error(lens: RadialLens) -> dict[str, list[float]]:
+    one_by_one = [compare_lens(Truth(), undistortion(one), 0.0) for one in lens]
     center = np.linalg.norm(lens.center.numpy() - CENTER, axis=1)
     return {
-        "center_error_px": float(np.median(center)),
-        "largest_error_raw_px": float(np.median(raw)),
-        "largest_error_similarity_px": float(np.median(similar)),
-        "largest_radial_error_px": float(_radial_error(lens).median()),
+        "center_error_px": center.tolist(),
+        "largest_error_raw_px": [one.raw_px for one in one_by_one],
+        "largest_error_similarity_px": [one.similarity_px for one in one_by_one],
+        "largest_radial_error_px": _radial_error(lens).tolist(),
     }
+
+
+def _medians(errors: dict[str, list[float]]) -> dict:
+    return {key: float(np.median(values)) for key, values in errors.items()}
 
 
 def _radial_error(lens: RadialLens) -> Tensor:
@@ -212,25 +244,25 @@ def _lens(center: Tensor, coefficients: Tensor) -> RadialLens:
 def _draw(lines: list[np.ndarray], held: FixedPoint, floor: float, out: Path) -> None:
     """Figure 2 at the paper's noise; and the slow variant, with the level that it tends to."""
     problem = Problem.from_patterns(
-        noisy(lines, SIGMAS[-1], 1), torch.tensor(POWERS, dtype=torch.float64)
+        noisy([lines], SIGMAS[-1]), torch.tensor(POWERS, dtype=torch.float64)
     )
-    # The state after k iterations is where the loop stands when it may do k.
-    states = [_iterate(problem, most) for most in range(26)]
+    start = _start(problem)
+    states = [(start, start.new_zeros(1, len(POWERS)))]
+    for most in range(1, 26):  # where the loop stands when it may do so many iterations
+        loop = _iterate(problem, most)
+        states.append((loop.center, loop.coefficients))
+    corrected = [problem.correct(*state) for state in states]
     mask = problem.weight[0] > 0
-    ways = [problem.correct(one.center, one.coefficients)[0][mask] for one in states]
-    final = problem.correct(states[-1].center, states[-1].coefficients)[0]
     figure = draw_correction(
         [line[kept].numpy() for line, kept in zip(problem.points[0], mask, strict=True)],
-        [line[kept].numpy() for line, kept in zip(final, mask, strict=True)],
-        np.stack([one.center[0].numpy() for one in states]),
+        [line[kept].numpy() for line, kept in zip(corrected[-1][0], mask, strict=True)],
+        np.stack([center[0].numpy() for center, _ in states]),
         SIZE,
-        trajectories=np.stack([way.numpy() for way in ways]),
+        trajectories=np.stack([one[0][mask].numpy() for one in corrected]),
         true_center=CENTER,
     )
     save_figure(figure, out / "figure2_left_correction.png")
-    variances = np.stack(
-        [line_variances(problem, problem.correct(s.center, s.coefficients))[0] for s in states]
-    )
+    variances = np.stack([line_variances(problem, one)[0] for one in corrected])
     save_figure(
         draw_convergence(variances, title=f"$l_0$ free, noise of {SIGMAS[-1]:g} px"),
         out / "figure2_right_convergence.png",

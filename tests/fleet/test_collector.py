@@ -350,6 +350,7 @@ class TestNothingSeen:
         (zoom,) = record.zooms
         assert (zoom.patterns, zoom.lines) == (None, 0)
         assert "no line" in zoom.error
+        assert zoom.nominal_zoom == 2.0
         assert zoom.magnification == pytest.approx(2.0)
         assert zoom.magnification_sigma is None
         truth = CameraTruth.of(one.simulated)

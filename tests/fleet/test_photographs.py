@@ -115,15 +115,17 @@ class TestPhotographs:
         (folder / "notes.txt").write_text("not a photograph")
         found = collect_photographs(folder, tmp_path / "run", BOARD)
         assert len(found.used) == 6
-        assert set(found.skipped) == {"wall.png", "broken.jpg"}
+        assert set(found.skipped) == {"wall.png"}
         assert "no board of 7x5" in found.skipped["wall.png"]
-        assert "no picture" in found.skipped["broken.jpg"]
+        assert set(found.unreadable) == {"broken.jpg"}
+        assert "no picture" in found.unreadable["broken.jpg"]
 
-    def test_a_cut_jpeg_is_skipped(self, folder, tmp_path):
+    def test_a_cut_jpeg_is_unreadable(self, folder, tmp_path):
         data = cv2.imencode(".jpg", photograph(0))[1].tobytes()
         (folder / "cut.jpg").write_bytes(data[: len(data) // 2])
         found = collect_photographs(folder, tmp_path / "run", BOARD)
-        assert found.skipped.keys() == {"cut.jpg"}
+        assert found.unreadable.keys() == {"cut.jpg"}
+        assert found.skipped == {}
         assert len(found.used) == 6
 
     def test_several_sizes_are_refused_with_names(self, folder, tmp_path):
@@ -148,6 +150,27 @@ class TestPhotographs:
         (tmp_path / "gate" / "observations.jsonl").write_text("")
         with pytest.raises(ValueError, match="another name"):
             collect_photographs(album, tmp_path, BOARD, name="gate")
+
+    def test_does_not_replace_earlier_photographs(self, album, tmp_path):
+        collect_photographs(album, tmp_path, BOARD, name="gate")
+        before = (tmp_path / "gate" / "camera.json").read_bytes()
+        with pytest.raises(ValueError, match=r"gate: holds .*another name \(--name\).*--out"):
+            collect_photographs(album, tmp_path, BOARD, name="gate")
+        assert (tmp_path / "gate" / "camera.json").read_bytes() == before
+
+    def test_magnification_and_aspect_reach_the_lens(self, album, tmp_path):
+        collect_photographs(album, tmp_path, BOARD, "gate", magnification=3.0, pixel_aspect=0.985)
+        assert solve(tmp_path).all_ok
+        table = ZoomTable.load(tmp_path / "gate" / "table.json")
+        assert table.zooms == [3.0]
+        assert table.lens.pixel_aspect.tolist() == [0.985]
+
+    @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
+    @pytest.mark.parametrize("what", ["magnification", "pixel_aspect"])
+    def test_what_is_no_magnification_or_aspect(self, album, tmp_path, what, value):
+        with pytest.raises(ValueError, match=f"{what.replace('_', ' ')} must be positive"):
+            collect_photographs(album, tmp_path / "run", BOARD, "gate", **{what: value})
+        assert not (tmp_path / "run").exists()
 
     def test_a_name_that_is_no_folder(self, album, tmp_path):
         with pytest.raises(ValueError, match="cannot name a folder"):
@@ -215,6 +238,11 @@ class TestLineSet:
         with pytest.raises(ValueError, match=rf"harp.npz: .*{words}"):
             self.collect(tmp_path, **values)
         assert not (tmp_path / "run").exists()
+
+    def test_does_not_replace_an_earlier_set(self, tmp_path):
+        self.collect(tmp_path)
+        with pytest.raises(ValueError, match="another name"):
+            self.collect(tmp_path)
 
     def test_a_line_of_two_points(self, tmp_path):
         with pytest.raises(ValueError, match=r"harp.npz: .*line 0: 2 points"):

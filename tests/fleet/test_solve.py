@@ -132,6 +132,51 @@ class TestGoodRun:
         assert zoom["rms_px"] == summary.cameras["a"].zooms[1].rms_px == pytest.approx(0.1, rel=0.2)
 
 
+class TestNominalZoom:
+    def test_it_reaches_table_and_summary(self, run):
+        record = CameraRecord.load(run / "a")
+        record.zooms[1].nominal_zoom = 4.2
+        record.save(run / "a")
+        assert [zoom.nominal_zoom for zoom in solve(run).cameras["a"].zooms] == [None, 4.2]
+        table = ZoomTable.load(run / "a" / "table.json")
+        assert [knot.nominal_zoom for knot in table.knots] == [None, 4.2]
+        stored = json.loads((run / "summary.json").read_text())
+        assert stored["cameras"]["a"]["zooms"][1]["nominal_zoom"] == 4.2
+
+
+class TestUnknownCenter:
+    def test_the_covariance_of_the_coefficients_is_kept(self, tmp_path):
+        straight = of(synthetic.lens((0.0, 0.0, 0.0)))
+        collected(tmp_path, "a", (1.0, straight))
+        assert solve(tmp_path).cameras["a"].zooms[0].status == "CENTER_UNOBSERVABLE"
+        (knot,) = ZoomTable.load(tmp_path / "a" / "table.json").knots
+        assert torch.equal(knot.covariance.diagonal()[:2], torch.full((2,), torch.inf).double())
+        expected = estimate(straight).covariance[0]
+        assert torch.allclose(knot.covariance[2:, 2:], expected[2:, 2:], rtol=1e-6)
+        assert bool((knot.covariance.diagonal()[2:] > 0).all())
+
+
+class TestOnlySomeCameras:
+    """A run's folder that was used before, for other cameras."""
+
+    def test_the_others_enter_neither_summary_nor_success(self, run):
+        collected(run, "gone", error="camera gone: was taken down")
+        assert not solve(run).all_ok
+        summary = solve(run, cameras=["b", "a"])
+        assert summary.all_ok
+        assert list(summary.cameras) == ["b", "a"]
+        assert list(json.loads((run / "summary.json").read_text())["cameras"]) == ["b", "a"]
+
+    def test_one_that_left_nothing_is_reported(self, run):
+        summary = solve(run, cameras=["a", "new"])
+        assert summary.cameras["a"].ok
+        assert "new: nothing was collected there" in summary.cameras["new"].error
+
+    def test_none_of_them_is_there(self, run):
+        with pytest.raises(ValueError, match="none of new, newer has been collected"):
+            solve(run, cameras=["new", "newer"])
+
+
 class TestOffsets:
     def test_items_without_offsets_get_no_gain(self, tmp_path):
         scanned, truth = synthetic.head_pattern(1500.0, (0.02, 0.03, 0.01))

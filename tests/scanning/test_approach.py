@@ -156,6 +156,38 @@ class TestFound:
         tilts = [pose.tilt for pose in setup.camera.poses]
         assert low - 1e-9 <= min(tilts) <= max(tilts) <= high + 1e-9
 
+    @pytest.mark.parametrize("aspect", [1.0, 0.87])
+    @pytest.mark.parametrize("tilt_deg", [60.0, 75.0, 85.0])
+    def test_far_below(self, clock, tilt_deg, aspect):
+        """Pan moves the picture by cos(tilt) only, and turns it."""
+        setup = Setup(clock, ball={"tilt_deg": tilt_deg}, head={"pixel_aspect": aspect})
+        found = setup.approach(20.0, tilt_deg - 3, pixel_aspect=aspect)
+        setup.assert_centred(found)
+        focal_length = setup.camera.truth.optics.at(16384).focal_length
+        assert found.focal_length == pytest.approx(focal_length, rel=0.04)
+
+    @pytest.mark.parametrize("given", [0.7, 1.4])
+    def test_with_a_field_of_view_that_is_not_true(self, clock, given):
+        setup = Setup(clock, ball={"tilt_deg": 40.0})
+        can = setup.camera.capabilities
+        wrong = dataclasses.replace(can, horizontal_fov=can.horizontal_fov * given)
+        setup.camera.capabilities = wrong
+        setup.assert_centred(setup.approach(18.0, 38.0))
+
+    def test_at_the_end_of_the_tilt_range_it_turns_back(self, clock):
+        """The feature is beyond the limit: a probe towards the middle would not move."""
+        setup = Setup(clock, ball={"tilt_deg": 89.0})
+        setup.camera.capabilities = dataclasses.replace(
+            setup.camera.capabilities, tilt_limits=(math.radians(-25), math.radians(88.7))
+        )
+        found = setup.approach(20.0, 88.5)
+        assert found.pose.zoom == 16384
+        first, probe = (math.degrees(look.commanded.tilt) for look in setup.looks[:2])
+        assert probe < first - 3
+        low, high = setup.camera.capabilities.tilt_limits
+        tilts = [pose.tilt for pose in setup.camera.poses]
+        assert low - 1e-9 <= min(tilts) <= max(tilts) <= high + 1e-9
+
     def test_with_pixels_that_are_not_square(self, clock):
         setup = Setup(clock, head={"pixel_aspect": 1.07})
         setup.assert_centred(setup.approach(14.0, 12.0, pixel_aspect=1.07))
@@ -171,6 +203,16 @@ class TestAxes:
         setup = Setup(clock, **{f"{axis}_sign": -1})
         with pytest.raises(MotionError, match=f"camera gate: .*{axis} axis; set {axis}_sign to"):
             setup.approach()
+
+    @pytest.mark.parametrize("axis", ["pan", "tilt"])
+    @pytest.mark.parametrize("tilt_deg", [60.0, 75.0])
+    def test_far_below_too(self, clock, axis, tilt_deg):
+        # Configured the wrong way round the camera sees below what is said to be above.
+        sign = -1 if axis == "tilt" else 1
+        setup = Setup(clock, **{f"{axis}_sign": -1}, ball={"tilt_deg": tilt_deg})
+        pan_deg = 20.0 if axis == "tilt" else -20.0
+        with pytest.raises(MotionError, match=f"camera gate: .*{axis} axis; set {axis}_sign to"):
+            setup.approach(pan_deg, sign * (tilt_deg - 3))
 
     def test_a_picture_that_does_not_follow(self, clock):
         setup = Setup(clock)

@@ -15,7 +15,6 @@ from torchptz.geometry import (
     pan_tilt_to_see,
     project,
     ray_from_pan_tilt,
-    tilt_on_plane,
     to_camera,
     wrap_angle,
 )
@@ -35,6 +34,20 @@ def planned(focal_length=FOCAL, lines=(5, 5, 4)):
 
 def feature(pan=0.2, tilt=0.15):
     return ray_from_pan_tilt(*double(pan, tilt))
+
+
+def tilts_on_plane(plane, ray, pan):
+    """Both tilts (numpy) that put a ray on a plane: ``A cos t + B sin t = C`` for a given pan.
+
+    The pan turns the ray about y and leaves its height alone; of that the tilt makes
+    ``b2 (y cos t - z sin t) + b3 (y sin t + z cos t) = -b1 x``.
+    """
+    (b1, b2, b3), (x, y, z) = plane, ray
+    x, z = x * np.cos(pan) + z * np.sin(pan), z * np.cos(pan) - x * np.sin(pan)
+    a, b, c = b2 * y + b3 * z, b3 * y - b2 * z, -b1 * x
+    with np.errstate(invalid="ignore"):
+        half = np.arccos(c / np.hypot(a, b))
+    return np.arctan2(b, a) + half, np.arctan2(b, a) - half
 
 
 def steps_of(scan):
@@ -80,11 +93,11 @@ class TestEquations:
         planes, start, end = planned()
         ray = feature()
         scan = scan_lines(planes, ray, start, end, 21)
-        both = torch.stack(
-            tilt_on_plane(
-                planes[:, None].expand(-1, 21, 3), ray.expand(*scan.pan.shape, 3), scan.pan
-            )
-        )
+        both = [
+            tilts_on_plane(plane.numpy(), ray.numpy(), pan.numpy())
+            for plane, pan in zip(planes, scan.pan, strict=True)
+        ]
+        both = torch.from_numpy(np.stack(both, 1))
         off = wrap_angle(both - scan.tilt).abs().nan_to_num(10.0).amin(0)
         # Where a line runs along the tilt axis the closed form for a given pan is ill-conditioned.
         assert off.median() < 1e-9
@@ -126,10 +139,93 @@ class TestPath:
         first_out = (~scan.mask).int().argmax(1)
         assert any(scan.mask[i, first_out[i] :].any() for i in range(len(planes)))
 
-    def test_a_point_that_no_pose_sees_is_an_error(self):
-        planes, start, end = planned()
-        with pytest.raises(ValueError, match=r"scan \d+: no pose of the head sees"):
+    def test_a_feature_that_no_pose_sees_on_any_line_is_an_error(self):
+        planes, start, end = planned(lines=(2, 2, 0))
+        with pytest.raises(ValueError, match="no pose of the head sees the feature on any"):
             scan_lines(planes, double(0.0, 1.0, 0.01), start, end, 11)
+
+
+class TestReach:
+    """A feature far above or below cannot be brought far to the side of the picture."""
+
+    LIMITS = ((-math.pi, math.pi), (math.radians(-25), math.radians(90)))
+
+    @staticmethod
+    def sees(tilt, image):
+        """Whether some pose puts the ray there: a turn about the tilt axis keeps the distance from
+        it, and that of the image direction must be no less than the ray's height."""
+        x, y = image.unbind(-1)
+        return math.sin(abs(tilt)) <= torch.hypot(y, torch.ones_like(y)) / (1 + x**2 + y**2).sqrt()
+
+    @pytest.mark.parametrize("limits", [((-math.pi, math.pi), (-3.0, 3.0)), LIMITS], ids=str)
+    @pytest.mark.parametrize("steps", [11, 39])
+    @pytest.mark.parametrize("tilt_deg", [60.0, 70.0, 80.0, -70.0])
+    def test_what_can_be_reached_is_scanned_as_ever(self, tilt_deg, steps, limits):
+        if tilt_deg < 0:  # a head that looks up as far as the others look down
+            limits = limits[0], (-limits[1][1], -limits[1][0])
+        planes, start, end = planned(lines=(9, 9, 4))
+        ray = feature(tilt=math.radians(tilt_deg))
+        scan = scan_lines(planes, ray, start, end, steps, *limits)
+        assert scan.mask.any(1).double().mean() > 0.3
+        seen = to_camera(ray, scan.pan, scan.tilt)
+        on_plane = (planes[:, None] * seen).sum(-1)[scan.mask]
+        assert on_plane.abs().max() < 1e-10
+        two = scan.mask[:, 1:] & scan.mask[:, :-1]
+        moved = torch.where(two, steps_of(scan), math.nan)
+        constant = moved.nanmedian(1, keepdim=True).values
+        assert ((moved - constant).abs() / constant)[two].max() < 1e-9
+        along = ((project(seen) - start[:, None]) * (end - start)[:, None]).sum(-1)
+        share = along / (end - start).square().sum(-1, keepdim=True)
+        assert (share.diff(dim=1)[two] > 0).all()
+        assert share[scan.mask].min() > -1e-9
+        # Chords are shorter than their arcs: the last pose may lie a little past the end.
+        assert share[scan.mask].max() < 1.01
+        assert (scan.tilt[scan.mask] >= limits[1][0]).all()
+        assert (scan.tilt[scan.mask] <= limits[1][1]).all()
+
+    @pytest.mark.parametrize("tilt_deg", [60.0, 70.0, 80.0, -70.0])
+    def test_little_of_what_can_be_reached_is_left_out(self, tilt_deg):
+        planes, start, end = planned(lines=(9, 9, 4))
+        tilt, steps = math.radians(tilt_deg), 39
+        ray = feature(tilt=tilt)
+        scan = scan_lines(planes, ray, start, end, steps, tilt_limits=(-3.0, 3.0))
+        share = torch.linspace(0, 1, 2001, dtype=torch.float64)[:, None]
+        sees = self.sees(tilt, start[:, None] + share * (end - start)[:, None]).numpy()
+        seen = project(to_camera(ray, scan.pan, scan.tilt))
+        for i, line in enumerate(sees):
+            edges = np.flatnonzero(np.diff(np.r_[False, line, False].astype(int)))
+            longest = max((edges[1::2] - edges[::2]) / 2001, default=0.0)
+            kept = seen[i, scan.mask[i]]
+            # One sample of the search at either end, and a chord's fall short of its arc.
+            if longest > 0.1:
+                covered = (kept[-1] - kept[0]).norm() / (end[i] - start[i]).norm()
+                assert covered == pytest.approx(longest, abs=0.05)
+                assert abs(len(kept) - (1 + longest * (steps - 1))) < 2
+            elif longest == 0:
+                assert len(kept) == 0
+
+    def test_lines_that_are_reached_from_end_to_end_do_not_change(self):
+        planes, start, end = planned(lines=(9, 9, 4))
+        ray = feature(tilt=math.radians(70.0))
+        scan = scan_lines(planes, ray, start, end, 21, tilt_limits=(-3.0, 3.0))
+        whole = scan.mask.all(1)
+        assert 0 < whole.double().mean() < 1
+        alone = scan_lines(planes[whole], ray, start[whole], end[whole], 21, tilt_limits=(-3, 3))
+        torch.testing.assert_close(alone.pan, scan.pan[whole])
+        torch.testing.assert_close(alone.tilt, scan.tilt[whole])
+
+    def test_of_two_stretches_that_within_the_limits_is_taken(self):
+        # Far at the side the upper and the lower end of a vertical line can be reached; the lower
+        # one is shorter here, but the upper one needs tilts beyond 90 degrees.
+        line = double(1.0, 0.0, -0.3)[None]
+        start, end = double(0.3, -1.2)[None], double(0.3, 1.0)[None]
+        ray = feature(tilt=math.radians(75.0))
+        free = scan_lines(line, ray, start, end, 41, tilt_limits=(-3.0, 3.0))
+        limited = scan_lines(line, ray, start, end, 41, *self.LIMITS)
+        for scan, sign in ((free, -1), (limited, 1)):
+            height = project(to_camera(ray, scan.pan, scan.tilt))[scan.mask][:, 1]
+            assert len(height) > 3
+            assert (sign * height > 0).all()
 
 
 class TestPlaneDistance:

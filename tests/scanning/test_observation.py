@@ -59,6 +59,7 @@ class FakeCamera:
         self.moves, self.pictures, self.readings = [], 0, 0
         self.swing = lambda number: 0.0  # px, of the ball in a picture
         self.after_picture = lambda number: None
+        self.flicker = lambda number: (0, 0, 0)  # quanta, quanta, units: added to a reading
         self.ball = True
         rng = np.random.default_rng(1)
         self.wall = np.kron(rng.integers(20, 110, (60, 80)), np.ones((4, 4))).astype(float)
@@ -75,8 +76,12 @@ class FakeCamera:
         self.clock.sleep(self.reply_s)
         self.readings += 1
         pose = self.true_pose()
-        whole = [round(angle / QUANTUM) * QUANTUM for angle in (pose.pan, pose.tilt)]
-        return Pose(*whole, pose.zoom)
+        pan, tilt, zoom = self.flicker(self.readings)
+        whole = [
+            (round(angle / QUANTUM) + count) * QUANTUM
+            for angle, count in ((pose.pan, pan), (pose.tilt, tilt))
+        ]
+        return Pose(*whole, pose.zoom + zoom)
 
     def ball_pixel(self, pose):
         """The ball is ahead at THERE; panning left moves it right, tilting down moves it up."""
@@ -176,11 +181,72 @@ class TestAtRest:
         seen = setup.look(near)
         assert_consistent(seen, setup.camera)
 
-    def test_a_stop_one_quantum_off_is_accepted_as_read(self, clock):
-        beside = Pose(THERE.pan + QUANTUM, THERE.tilt, 0.0)
-        setup = Setup(clock, lambda start, target, t: beside)
+    @pytest.mark.parametrize("quanta", [(1, 0), (0, -3), (5, 5), (-5, 0)], ids=str)
+    @pytest.mark.parametrize("speed", [1.0, 0.1, math.inf])
+    def test_a_stop_some_quanta_beside_is_accepted_as_read(self, clock, quanta, speed):
+        beside = Pose(THERE.pan + quanta[0] * QUANTUM, THERE.tilt + quanta[1] * QUANTUM, 0.0)
+        path = steady(speed) if speed < math.inf else lambda start, target, t: target
+        setup = Setup(clock, lambda start, target, t: path(start, beside, t))
         seen = setup.look()
+        assert seen.commanded == THERE
         assert seen.read_after.pan == pytest.approx(beside.pan)
+        assert seen.read_after.tilt == pytest.approx(beside.tilt)
+        assert_consistent(seen, setup.camera)
+        # the head did arrive there before the pictures, and stayed a moment
+        assert f"{max(map(abs, quanta))}.0 quanta beside it" in seen.rest_rule
+        assert setup.camera.moves == [THERE]
+
+    def test_at_the_target_nothing_is_waited_for(self, clock):
+        setup = Setup(clock)
+        started = clock.now
+        assert "at the target" in setup.look().rest_rule
+        assert clock.now - started < 0.2
+
+    def test_the_feature_is_looked_for_where_the_reading_says(self, clock):
+        beside = Pose(THERE.pan + 5 * QUANTUM, THERE.tilt, 0.0)
+        setup = Setup(clock, lambda start, target, t: beside)
+        asked = []
+
+        def near(reading):
+            asked.append(reading)
+            return tuple(setup.camera.ball_pixel(reading))
+
+        assert setup.look(near=near, search_radius=4).found
+        assert [pose.pan for pose in asked] == pytest.approx([beside.pan] * len(asked))
+
+    @pytest.mark.parametrize("quanta", [2, 4])
+    @pytest.mark.parametrize("delay", [0.3, 0.6, 0.9])
+    def test_a_move_of_a_few_quanta_that_starts_late_is_waited_for(self, clock, quanta, delay):
+        """The head stands beside its target from the start, but not because it has stopped."""
+        setup = Setup(clock, steady(1.0, delay=delay))
+        setup.camera.start = setup.camera.target = THERE
+        near = Pose(THERE.pan + quanta * QUANTUM, THERE.tilt, 0.0)
+        seen = setup.look(near)
+        assert seen.read_before.pan == pytest.approx(near.pan)
+        assert_consistent(seen, setup.camera)
+
+    @pytest.mark.parametrize("rest", [0, 3], ids=["at the target", "beside it"])
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_a_reading_that_flickers_by_one_count_is_at_rest(self, clock, axis, rest):
+        beside = Pose(THERE.pan + rest * QUANTUM, THERE.tilt, 0.0)
+        setup = Setup(clock, lambda start, target, t: beside)
+        random = np.random.default_rng(5).integers(0, 2, 1000)
+        count = [1, 1, 6][axis]  # 6 of 16384 units of zoom
+        setup.camera.flicker = lambda number: tuple(
+            count * int(random[number]) * (axis == i) for i in range(3)
+        )
+        looks = [setup.look() for _ in range(8)]
+        assert setup.camera.moves == [THERE] * 8
+        for seen in looks:
+            np.testing.assert_allclose(seen.pixel, setup.camera.ball_pixel(beside), atol=0.2)
+        assert any(seen.read_before != seen.read_after for seen in looks)
+
+    def test_creeping_towards_the_target_is_no_stop(self, clock):
+        """Slower than one quantum between two readings, but not standing."""
+        setup = Setup(clock, steady(0.3 * QUANTUM / (POLL_S + REPLY_S)))
+        setup.camera.start = setup.camera.target = Pose(THERE.pan - 8 * QUANTUM, THERE.tilt, 0.0)
+        seen = setup.look()
+        assert seen.read_before.pan == pytest.approx(THERE.pan)
         assert_consistent(seen, setup.camera)
 
     def test_pan_is_compared_on_the_circle(self, clock):
@@ -249,6 +315,20 @@ class TestMovedBySomebody:
         assert_consistent(seen, setup.camera)
         assert len(setup.recorded) == 1
 
+    def test_by_two_quanta_is_noticed(self, clock):
+        """More than a flicker, though the picture hardly shows it and the stop would do."""
+        setup = Setup(clock)
+        elsewhere = Pose(THERE.pan + 2 * QUANTUM, THERE.tilt, 0.0)
+
+        def push(number):
+            if number == 2:
+                setup.camera.target = elsewhere
+
+        setup.camera.after_picture = push
+        seen = setup.look()
+        assert setup.camera.moves == [THERE, THERE]
+        assert_consistent(seen, setup.camera)
+
     def test_again_and_again_is_an_error(self, clock):
         setup = Setup(clock)
         elsewhere = Pose(THERE.pan + 5 * QUANTUM, THERE.tilt, 0.0)
@@ -283,6 +363,15 @@ class TestErrors:
         path = steady(0.05)
         setup = Setup(clock, lambda start, target, t: path(start, target, min(t, 0.5)))
         with pytest.raises(MotionError, match=r"camera gate: .*stopped elsewhere.*another user"):
+            setup.look()
+        assert setup.camera.pictures == 0
+
+    @pytest.mark.parametrize("quanta", [(6, 0), (0, -6)], ids=str)
+    def test_a_stop_farther_off_than_that(self, clock, quanta):
+        beside = Pose(THERE.pan + quanta[0] * QUANTUM, THERE.tilt + quanta[1] * QUANTUM, 0.0)
+        path = steady(1.0)
+        setup = Setup(clock, lambda start, target, t: path(start, beside, t))
+        with pytest.raises(MotionError, match=r"camera gate: .*stopped elsewhere"):
             setup.look()
         assert setup.camera.pictures == 0
 

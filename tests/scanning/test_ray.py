@@ -51,9 +51,29 @@ def test_displacement_from_the_principal_point_is_corrected():
     assert float(torch.linalg.vector_norm(torch.linalg.cross(mean, RAY))) > 4e-3
 
 
+def test_what_was_known_of_the_focal_length_counts_by_its_sigma():
+    pan, tilt = readings()
+    exact = seen(pan, tilt)
+    known = 1.05 * FOCAL
+    # Exact readings know better than anything said beforehand.
+    assert estimate_ray(pan, tilt, exact, POINT, known, 0.01 * known).focal_length == pytest.approx(
+        FOCAL, rel=1e-6
+    )
+    generator = torch.Generator().manual_seed(3)
+    noisy = exact + 30 * torch.randn(exact.shape, generator=generator, dtype=torch.float64)
+    alone = estimate_ray(pan, tilt, noisy, POINT, known)
+    sigma = alone.focal_length_sigma
+    together = estimate_ray(pan, tilt, noisy, POINT, known, sigma)
+    # Two values known equally well: their mean, sqrt(2) better than either.
+    assert together.focal_length == pytest.approx((alone.focal_length + known) / 2)
+    assert together.focal_length_sigma == pytest.approx(sigma / 2**0.5)
+
+
 def test_the_error_of_the_principal_point_moves_the_ray_by_as_much_over_f():
     pan, tilt = readings()
-    found = estimate_ray(pan, tilt, seen(pan, tilt), POINT + double(5.0, 0.0), FOCAL, 5.0)
+    found = estimate_ray(
+        pan, tilt, seen(pan, tilt), POINT + double(5.0, 0.0), FOCAL, principal_point_sigma=5.0
+    )
     assert angle_to_truth(found) == pytest.approx(5.0 / FOCAL, rel=1e-3)
     assert found.ray_sigma == pytest.approx(5.0 / FOCAL, rel=1e-3)
     assert found.focal_length == pytest.approx(FOCAL, rel=1e-5)

@@ -22,6 +22,13 @@ def observer_of(lens=NONE, **how):
     return FakeObserver(FakeCamera(RAY, lens, POINT, WIDEST, capabilities()), **how)
 
 
+def below(tilt):
+    """An observer of a ball far below, and its ray."""
+    ray = ray_from_pan_tilt(*synthetic.double(0.2, tilt))
+    can = capabilities(tilt_limits=(-0.5, math.pi / 2))
+    return FakeObserver(FakeCamera(ray, NONE, POINT, WIDEST, can)), ray
+
+
 def tracks_of(observer, count=8, focal_error=1.0, ray=RAY, aspect=1.0):
     return scan_tracks(observer, LEVELS, ray, 10 * WIDEST * focal_error, 8.0, SIZE, count, aspect)
 
@@ -101,14 +108,39 @@ class TestTracks:
         assert tracks.zoom_units == LEVELS
         assert tracks.sigma.shape == tracks.points.shape[:2]
 
+    def test_a_head_that_stops_beside_its_target_is_followed(self):
+        can = capabilities()
+        slip = (-4 * can.pan_quantum, 4 * can.tilt_quantum)  # 39 px at the longest zoom
+        found = [
+            np.isfinite(tracks_of(observer_of(slip=lambda _, by=by: by)).points[:, -1, 0]).sum()
+            for by in (slip, (slip[1], slip[0]))
+        ]
+        # Those that go over the border are no tracks.
+        assert min(found) >= 3
+
 
 class TestMissing:
-    def test_a_track_that_does_not_start_is_given_up_at_once(self):
+    def test_places_out_of_reach_of_a_feature_straight_below_are_left_out(self):
+        observer, ray = below(math.radians(89.5))
+        tracks = tracks_of(observer, ray=ray)
+        started = np.isfinite(tracks.points[:, -1]).all(-1)
+        assert 2 <= started.sum() < 8
+        assert all(math.isfinite(look.commanded.pan) for look in observer.looks)
+
+    def test_a_track_that_does_not_start_begins_farther_in(self):
         observer = observer_of(blind=lambda number: number == 0)
+        tracks = tracks_of(observer, count=4)
+        assert np.isfinite(tracks.points).all()
+        assert len(observer.looks) == 1 + 4 * 5
+        reach = np.abs(tracks.points[:, -1] - POINT).max(-1)
+        assert reach[0] < 0.9 * reach[2]  # the opposite one
+
+    def test_a_track_that_starts_nowhere_is_given_up(self):
+        observer = observer_of(blind=lambda number: number < 3)
         tracks = tracks_of(observer, count=4)
         assert np.isnan(tracks.points[0]).all()
         assert np.isfinite(tracks.points[1:]).all()
-        assert len(observer.looks) == 1 + 3 * 5
+        assert len(observer.looks) == 3 + 3 * 5
 
     def test_a_place_not_found_is_nan_and_the_track_goes_on(self):
         observer = observer_of(blind=lambda number: number == 2)

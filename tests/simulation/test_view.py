@@ -1,7 +1,11 @@
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from torchptz.simulation import view
 from torchptz.simulation.optics import LensState
 from torchptz.simulation.view import HeadPose, Mount, View, head_rotation, ray, tangents
 
@@ -37,6 +41,52 @@ class TestSigns:
         np.testing.assert_allclose((x, y), (73.8 * np.cos(0.1), 73.8 * np.sin(0.1)))
 
 
+class TestByHand:
+    """Numbers from the conventions alone: with these angles every entry is a fraction."""
+
+    PAN, TILT = np.arctan2(3, 4), np.arctan2(5, 12)  # sines 3/5 and 5/13, cosines 4/5 and 12/13
+
+    def test_pan(self):
+        expected = [[4 / 5, 0, 3 / 5], [0, 1, 0], [-3 / 5, 0, 4 / 5]]
+        np.testing.assert_allclose(head_rotation(self.PAN, 0.0), expected, atol=1e-15)
+
+    def test_tilt(self):
+        expected = [[1, 0, 0], [0, 12 / 13, -5 / 13], [0, 5 / 13, 12 / 13]]
+        np.testing.assert_allclose(head_rotation(0.0, self.TILT), expected, atol=1e-15)
+
+    def test_pan_then_tilt(self):
+        expected = [[4 / 5, 0, 3 / 5], [3 / 13, 12 / 13, -4 / 13], [-36 / 65, 5 / 13, 48 / 65]]
+        np.testing.assert_allclose(head_rotation(self.PAN, self.TILT), expected, atol=1e-15)
+
+    def test_the_ray_of_the_principal_point(self):
+        np.testing.assert_allclose(
+            ray(self.PAN, self.TILT), [-36 / 65, 5 / 13, 48 / 65], atol=1e-15
+        )
+
+    def test_a_point_ahead_is_seen_up_and_to_the_right_of_a_head_turned_left_and_down(self):
+        # (0, 0, 65) comes to (39, -20, 48)
+        seen = pixel((0, 0, 65), self.PAN, self.TILT)
+        np.testing.assert_allclose(seen, (370 + 738 * 39 / 48, 270 - 738 * 20 / 48))
+
+    def test_a_mount_turned_and_rolled(self):
+        # The boresight turns as the head does, then the content turns clockwise by a quarter: what
+        # was at (39, -20, 48) comes to (20, 39, 48).
+        boresight, roll = (self.PAN, self.TILT), np.pi / 2
+        seen = pixel((0, 0, 65), boresight=boresight, roll=roll)
+        np.testing.assert_allclose(seen, (370 + 738 * 20 / 48, 270 + 738 * 39 / 48))
+
+    def test_the_simulator_shares_no_formula_with_what_it_tests(self):
+        """An error of the core would cancel between the two."""
+        package = Path(view.__file__).parent
+        for module in package.glob("*.py"):
+            for node in ast.walk(ast.parse(module.read_text())):
+                names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+                if isinstance(node, ast.ImportFrom):
+                    assert node.level < 2, module.name
+                    names = [node.module or ""] if node.level == 0 else []
+                assert not any(name.split(".")[0] == "torchptz" for name in names), module.name
+
+
 class TestGeometry:
     def test_rotation_against_scipy(self):
         for pan, tilt in ((0.3, 0.2), (-2.0, 1.1)):
@@ -67,9 +117,9 @@ class TestGeometry:
 
     def test_rays_invert_projection(self):
         lens = LensState(738.0, (372, 269), (368, 273), (-0.02, -0.02, 0.002), 368.0, 0.985)
-        view = View.at(lens, Mount((0.01, -0.02), 0.05, 0.0), HeadPose(0.4, 0.2, 0))
+        exposure = View.at(lens, Mount((0.01, -0.02), 0.05, 0.0), HeadPose(0.4, 0.2, 0))
         points = np.array([[-3.0, 2.5, 9.0], [-4.0, 1.0, 8.0]])
-        inside = view.to_camera(points)
+        inside = exposure.to_camera(points)
         np.testing.assert_allclose(
-            view.rays(view.project(points)), inside / inside[:, 2:], atol=1e-10
+            exposure.rays(exposure.project(points)), inside / inside[:, 2:], atol=1e-10
         )

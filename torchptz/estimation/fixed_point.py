@@ -88,7 +88,7 @@ def iterate(
     history: list[Tensor] | None = [] if record else None
     # In rounds, each of the items that are still active: a few slow ones do not make all the
     # others be computed along.
-    length = max_iterations if record else _ROUND
+    length = max(max_iterations, 1) if record else _ROUND
     for begun in range(0, max_iterations, length):
         rows = state.active.nonzero()[:, 0]
         if len(rows) == 0:

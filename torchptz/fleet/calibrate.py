@@ -47,5 +47,8 @@ def calibrate(
         ConfigError: the configuration cannot be used.
         ValueError: what `solve` refuses.
     """
+    if not isinstance(config, FleetConfig):
+        config = load_config(config)
     collect_fleet(config, out, progress)
-    return solve(out, powers)
+    # The run's folder may still hold cameras of an earlier configuration.
+    return solve(out, powers, cameras=[camera.name for camera in config.cameras])

@@ -37,6 +37,9 @@ _EXPECTED = (CameraError, ValueError, OSError, Stopped)  # by those who wrote th
 # Relative error of a focal length that comes over the zoom tracks: their outer ends, near the
 # border at the longest zoom, are bent by the lens there. 0.2 to 0.8 % on simulated lenses.
 _TRACKS_BEND = 0.005
+# Relative error of the longest focal length before it is measured there: from the wide end's by the
+# nominal magnification, or by the measured one (the first moves are of a few degrees only).
+_NOMINAL, _FIRST_MOVES = 0.1, 0.03
 _WIDEST_OVERSCAN = 1.08  # of the undistorted picture over the real one, before anything is seen
 
 
@@ -125,7 +128,7 @@ class Collector:
         found = approach(observer, self._image_size, direction, config.pixel_aspect)
         looks = self._look_around(observer, found)
         middle = torch.tensor(self._image_size, dtype=torch.float64) / 2 - 0.5
-        rough = self._ray(looks, middle, found.focal_length, 0.0)
+        rough = self._ray(looks, middle, found.focal_length, _NOMINAL, 0.0)
 
         levels = track_levels(camera, zooms)
         self._tell("following zoom tracks", 0, 1)
@@ -150,7 +153,13 @@ class Collector:
             )
         pp, covariance = meeting.position[0], meeting.covariance[0]
         magnification, magnification_sigma = estimate_magnification(points, mask, pp[None])
-        ray = self._ray(looks, pp, rough.focal_length, float(covariance.diagonal().max().sqrt()))
+        # The wide end's focal length, from the first moves, times the magnification just measured.
+        longest = float(magnification[0, -1])
+        if not longest > 0:
+            longest = camera.magnification(levels[-1])
+        known = found.focal_length * longest / camera.magnification(levels[-1])
+        pp_sigma = float(covariance.diagonal().max().sqrt())
+        ray = self._ray(looks, pp, known, _FIRST_MOVES, pp_sigma)
         record.principal_point = pp.tolist()
         record.principal_point_covariance = covariance.tolist()
         record.ray, record.ray_sigma = ray.ray.tolist(), ray.ray_sigma
@@ -170,6 +179,7 @@ class Collector:
             focal_length = ray.focal_length * relative
             parts = (ray.focal_length_sigma / ray.focal_length, spread / measured, _TRACKS_BEND)
             zoom_record = ZoomRecord(
+                nominal_zoom=config.zooms[index],
                 zoom_units=zoom,
                 magnification=measured,
                 magnification_sigma=spread if math.isfinite(spread) else None,
@@ -274,7 +284,12 @@ class Collector:
         return looks
 
     def _ray(
-        self, looks: list[Observation], pp: torch.Tensor, focal_length: float, pp_sigma: float
+        self,
+        looks: list[Observation],
+        pp: torch.Tensor,
+        focal_length: float,
+        relative_sigma: float,
+        pp_sigma: float,
     ) -> FeatureRay:
         if len(looks) < 5:
             raise CameraError(
@@ -291,6 +306,7 @@ class Collector:
             tensor([one.pixel for one in looks]),
             pp,
             focal_length,
+            focal_length * relative_sigma,
             pp_sigma,
             self._config.pixel_aspect,
         )

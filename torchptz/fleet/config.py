@@ -13,6 +13,7 @@ from pydantic_core.core_schema import ValidationInfo
 
 from torchptz.cameras import DIALECTS, Credentials
 from torchptz.cameras.wire import parse_address
+from torchptz.files import write_whole
 from torchptz.fleet.config_sections import (
     CredentialsConfig,
     FeatureConfig,
@@ -166,7 +167,7 @@ class FleetConfig(Section):
         It holds where each password comes from, as the configuration did, and no password.
         """
         text = yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-        Path(path).write_text(text, encoding="utf-8")
+        write_whole(path, text)
 
 
 def load_config(path: str | Path) -> FleetConfig:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
 from torchptz.cameras import Pose
+from torchptz.files import without_nan
 from torchptz.scanning.observation import Observation
 
 JOURNAL_NAME = "observations.jsonl"
@@ -34,7 +34,7 @@ class Journal:
 
     def write(self, observation: Observation) -> None:
         """Append one observation and hand it to the operating system."""
-        self._file.write(json.dumps(_plain(asdict(observation))) + "\n")
+        self._file.write(json.dumps(without_nan(asdict(observation)), allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:
@@ -63,14 +63,3 @@ def read_journal(path: Path) -> Iterator[Observation]:
                 return
             raise ValueError(f"{path}, line {number}: not an observation ({error})") from error
         yield observation
-
-
-def _plain(value: object) -> object:
-    """JSON has no NaN: what is not finite is stored as null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

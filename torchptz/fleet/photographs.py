@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import re
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import cv2
 import numpy as np
 
+from torchptz.files import read_arrays
 from torchptz.fleet.config import check_name
 from torchptz.fleet.journal import JOURNAL_NAME
 from torchptz.fleet.pictures import SUFFIXES, UnreadablePicture, find_pictures, read_picture
-from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
+from torchptz.fleet.records import RECORD_NAME, CameraRecord, ZoomRecord, save_patterns
 from torchptz.patterns import LinePatterns
 
 _FEWEST_CORNERS = 3  # a line needs as many points
@@ -24,8 +24,6 @@ _FEWEST_CORNERS = 3  # a line needs as many points
 _WINDOW = 0.3
 _SMALLEST_WINDOW, _LARGEST_WINDOW = 3, 15  # px
 _SUBPIXEL_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
-# What numpy raises for another file, a cut one and a damaged one.
-_NO_ARRAYS = (ValueError, OSError, EOFError, BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,58 @@ class Collected:
     folder: Path  # the camera's folder in the run
     record: CameraRecord
     used: tuple[str, ...]  # photographs that lines came from
-    skipped: dict[str, str]  # photograph -> why it was left out
+    skipped: dict[str, str]  # photograph without the board -> what was sought in it
+    unreadable: dict[str, str]  # file that is no whole photograph -> why
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """Where what comes from files goes to; made before the work, to refuse what cannot be kept."""
+
+    folder: Path
+    magnification: float
+    pixel_aspect: float
+
+    @classmethod
+    def of(
+        cls,
+        out: str | Path,
+        name: str | None,
+        default: str,
+        magnification: float,
+        pixel_aspect: float,
+    ) -> _Camera:
+        if name is None:
+            # Folders and files may have names that cameras may not.
+            name = re.sub(r"[^\w.-]+", "_", default).strip("._-")[:64] or "camera"
+        for what, value in (("magnification", magnification), ("pixel aspect", pixel_aspect)):
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"camera {name}: the {what} must be positive, not {value}")
+        folder = Path(out) / check_name(name)
+        if (folder / RECORD_NAME).exists() or (folder / JOURNAL_NAME).exists():
+            raise ValueError(
+                f"{folder}: holds what has been collected for a camera of this name; give the new "
+                "one another name (--name) or another folder (--out), or remove the old one first"
+            )
+        return cls(folder, magnification, pixel_aspect)
+
+    def save(self, patterns: LinePatterns) -> CameraRecord:
+        width, height = (round(side) for side in patterns.image_size[0].tolist())
+        zoom = ZoomRecord(
+            magnification=self.magnification,
+            patterns=save_patterns(self.folder, 0, patterns),
+            lines=int(patterns.line_mask.sum()),
+            points=int(patterns.mask.sum()),
+        )
+        record = CameraRecord(
+            name=self.folder.name,
+            image_size=(width, height),
+            pixel_aspect=self.pixel_aspect,
+            zooms=[zoom],
+            finished=True,
+        )
+        record.save(self.folder)
+        return record
 
 
 def parse_board(text: str) -> tuple[int, int]:
@@ -60,6 +109,9 @@ def collect_photographs(
     board: tuple[int, int],
     name: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    magnification: float = 1.0,
+    pixel_aspect: float = 1.0,
 ) -> Collected:
     """Collect the pattern of one camera from photographs of a chessboard.
 
@@ -72,26 +124,30 @@ def collect_photographs(
         board: inner corners, (columns, rows).
         name: of the camera; default the folder's.
         progress: called with how many photographs are done, and of how many.
+        magnification: of all photographs; 1 = widest.
+        pixel_aspect: width over height of a pixel.
 
     Returns:
-        Collected. Photographs without the board, and unreadable ones, are in its ``skipped``.
+        Collected. Photographs without the board are in its ``skipped``, others in ``unreadable``.
 
     Raises:
-        ValueError: no photographs, several picture sizes, no photograph with the board.
+        ValueError: no photographs, several picture sizes, no photograph with the board, a camera
+            of this name in the run already, a magnification or aspect that is none.
     """
     folder = Path(folder)
+    camera = _Camera.of(out, name, folder.resolve().name, magnification, pixel_aspect)
     files = find_pictures(folder)
     if not files:
         raise ValueError(f"{folder}: there are no photographs ({', '.join(sorted(SUFFIXES))})")
     lines: list[np.ndarray] = []
     sizes: dict[tuple[int, int], list[str]] = {}
-    used, skipped = [], {}
+    used, skipped, unreadable = [], {}, {}
     for done, path in enumerate(files):
         progress(done, len(files))
         try:
             picture = read_picture(path, grey=True)
         except (OSError, UnreadablePicture) as error:
-            skipped[path.name] = getattr(error, "strerror", None) or str(error)
+            unreadable[path.name] = getattr(error, "strerror", None) or str(error)
             continue
         sizes.setdefault((picture.shape[1], picture.shape[0]), []).append(path.name)
         corners = find_corners(picture, board)
@@ -108,18 +164,26 @@ def collect_photographs(
             f"({several}); put each size into its own folder"
         )
     if not lines:
-        reasons = "; ".join(f"{file} {reason}" for file, reason in [*skipped.items()][:3])
-        more = f"; and {len(skipped) - 3} more" if len(skipped) > 3 else ""
+        unused = {**unreadable, **skipped}
+        reasons = "; ".join(f"{file} {reason}" for file, reason in [*unused.items()][:3])
+        more = f"; and {len(unused) - 3} more" if len(unused) > 3 else ""
         raise ValueError(
             f"{folder}: no photograph can be used ({reasons}{more}); give the board's inner "
             "corners, one fewer than squares a side"
         )
     (size,) = sizes
-    target, record = _save(LinePatterns.from_lists([lines], size), out, name, folder.resolve().name)
-    return Collected(target, record, tuple(used), skipped)
+    record = camera.save(LinePatterns.from_lists([lines], size))
+    return Collected(camera.folder, record, tuple(used), skipped, unreadable)
 
 
-def collect_line_set(path: str | Path, out: str | Path, name: str | None = None) -> Collected:
+def collect_line_set(
+    path: str | Path,
+    out: str | Path,
+    name: str | None = None,
+    *,
+    magnification: float = 1.0,
+    pixel_aspect: float = 1.0,
+) -> Collected:
     """Collect the pattern of one camera from a file of measured lines.
 
     Args:
@@ -128,19 +192,21 @@ def collect_line_set(path: str | Path, out: str | Path, name: str | None = None)
             lines come from, may be there.
         out: folder of the run; the camera gets a folder of its own in it.
         name: of the camera; default the file's.
+        magnification, pixel_aspect: as for `collect_photographs`.
 
     Raises:
         ValueError: not such a file, arrays missing or of wrong shapes, a line of fewer than 3
-            points, points outside the picture; names the file.
+            points, points outside the picture (names the file); a camera of this name in the run
+            already, a magnification or aspect that is none.
     """
     path = Path(path)
+    camera = _Camera.of(out, name, path.stem, magnification, pixel_aspect)
     lines, size, names = _read_line_set(path)
     try:
         patterns = LinePatterns.from_lists([lines], size)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    target, record = _save(patterns, out, name, path.stem)
-    return Collected(target, record, names, {})
+    return Collected(camera.folder, camera.save(patterns), names, {}, {})
 
 
 def find_corners(picture: np.ndarray, board: tuple[int, int]) -> np.ndarray | None:
@@ -172,12 +238,9 @@ def find_corners(picture: np.ndarray, board: tuple[int, int]) -> np.ndarray | No
 
 def _read_line_set(path: Path) -> tuple[list[np.ndarray], np.ndarray, tuple[str, ...]]:
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
+        arrays = read_arrays(path, "a set of lines")
     except FileNotFoundError:
         raise ValueError(f"{path}: there is no such file") from None
-    except (*_NO_ARRAYS, TypeError) as error:  # a lone array is no archive
-        raise ValueError(f"{path}: not a set of lines ({error})") from error
     missing = [key for key in ("xy", "line", "size") if key not in arrays]
     if missing:
         raise ValueError(f"{path}: not a set of lines: it lacks {', '.join(missing)}")
@@ -197,30 +260,6 @@ def _read_line_set(path: Path) -> tuple[list[np.ndarray], np.ndarray, tuple[str,
         raise ValueError(f"{path}: line must hold indices from 0{among}")
     names = tuple(map(str, arrays["names"].ravel())) if "names" in arrays else ()
     return [xy[line == index] for index in np.unique(line)], size, names
-
-
-def _save(
-    patterns: LinePatterns, out: str | Path, name: str | None, default: str
-) -> tuple[Path, CameraRecord]:
-    if name is None:
-        # Folders and files may have names that cameras may not.
-        name = re.sub(r"[^\w.-]+", "_", default).strip("._-")[:64] or "camera"
-    folder = Path(out) / check_name(name)
-    if (folder / JOURNAL_NAME).exists():
-        raise ValueError(
-            f"{folder}: holds what a camera has measured; give the new one another name"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    width, height = (round(side) for side in patterns.image_size[0].tolist())
-    zoom = ZoomRecord(
-        magnification=1.0,
-        patterns=save_patterns(folder, 0, patterns),
-        lines=int(patterns.line_mask.sum()),
-        points=int(patterns.mask.sum()),
-    )
-    record = CameraRecord(name=name, image_size=(width, height), zooms=[zoom], finished=True)
-    record.save(folder)
-    return folder, record
 
 
 def _some(names: list[str]) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from torchptz.files import write_whole
 from torchptz.lens import RadialLens
 from torchptz.rectification import rectify
 from torchptz.zoom_table import ZoomTable
@@ -78,7 +79,7 @@ def write_picture(path: str | Path, picture: np.ndarray) -> None:
         _, data = cv2.imencode(Path(path).suffix, picture)
     except cv2.error as error:
         raise ValueError(f"cannot be written as {Path(path).suffix} ({error.err})") from error
-    Path(path).write_bytes(data.tobytes())
+    write_whole(path, data.tobytes())
 
 
 def rectify_pictures(
@@ -98,7 +99,7 @@ def rectify_pictures(
         table: of the camera that took them.
         pictures: files, or folders of pictures.
         out: folder to write to; made if missing.
-        zoom: magnification at which they were taken; 1 = widest.
+        zoom: measured magnification at which they were taken, 1 = widest; see `ZoomTable.at`.
         zoom_units: or the zoom in the device's own units. Neither: a table of one zoom has no
             other.
         canvas, extrapolate: as for `rectify` and `ZoomTable.at`.

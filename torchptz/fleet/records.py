@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from torchptz.files import write_whole
 from torchptz.patterns import LinePatterns
 
 SCHEMA = "torchptz.camera_record"
@@ -27,6 +27,7 @@ class ZoomRecord(_Record):
     """One zoom of one camera."""
 
     zoom_units: float | None = None  # the device's own
+    nominal_zoom: float | None = Field(None, gt=0)  # magnification as the configuration asks for it
     magnification: float = Field(gt=0)  # measured, or nominal where it was not; 1 = widest
     magnification_sigma: float | None = Field(None, ge=0)
     focal_length_px: float | None = Field(None, gt=0)  # px, assumed in the offsets
@@ -104,18 +105,5 @@ class CameraRecord(_Record):
 def save_patterns(folder: str | Path, index: int, patterns: LinePatterns) -> str:
     """Write the pattern of a zoom into the camera's folder; returns what `ZoomRecord` calls it."""
     name = f"patterns/zoom_{index:02d}.npz"
-    path = Path(folder) / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    patterns.save(temporary)
-    os.replace(temporary, path)
+    patterns.save(Path(folder) / name)
     return name
-
-
-def write_whole(path: str | Path, text: str) -> None:
-    """Write a text file in one go: under another name first, then renamed."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)

@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 
 from torchptz.estimation import Fit, Status, estimate
-from torchptz.fleet.records import RECORD_NAME, CameraRecord, ZoomRecord, write_whole
+from torchptz.files import without_nan, write_whole
+from torchptz.fleet.records import RECORD_NAME, CameraRecord, ZoomRecord
 from torchptz.patterns import LinePatterns
 from torchptz.zoom_table import Knot, ZoomTable
 
@@ -33,7 +34,8 @@ _MOST_PADDING = 3
 class ZoomResult:
     """What became of one zoom of one camera."""
 
-    magnification: float
+    nominal_zoom: float | None  # magnification that was asked for
+    magnification: float  # measured, or nominal where it was not
     zoom_units: float | None  # the device's own
     ok: bool  # it has a lens, and collecting its lines went well
     status: str | None  # name of the fit's status; None where there was nothing to fit
@@ -93,6 +95,7 @@ def solve(
     powers: Sequence[float] = (1, 2, 3),
     *,
     offsets: bool = True,
+    cameras: Sequence[str] | None = None,
     **options: object,
 ) -> Summary:
     """Estimate the lenses of all cameras and zooms of a run; write a table for each camera.
@@ -102,6 +105,7 @@ def solve(
         powers: as for `estimate`.
         offsets: use the known offsets of the points, where there are any. Without, the results go
             to files of other names, so that both can be compared.
+        cameras: names of those to solve; default all that have been collected there.
         options: more of `estimate`'s, such as ``method``.
 
     Returns:
@@ -109,15 +113,19 @@ def solve(
         reported in it and stops no other.
 
     Raises:
-        ValueError: no folder, or no camera in it; and what `estimate` refuses.
+        ValueError: no folder, or none of the cameras in it; and what `estimate` refuses.
     """
     run = Path(run)
     if not run.is_dir():
         raise ValueError(f"{run}: there is no such folder")
     folders = sorted(path.parent for path in run.glob(f"*/{RECORD_NAME}"))
+    if cameras is not None:
+        there = {folder.name for folder in folders}
+        folders = [run / name for name in cameras] if there.intersection(cameras) else []
     if not folders:
+        wanted = "no camera" if cameras is None else f"none of {', '.join(cameras)}"
         raise ValueError(
-            f"{run}: no camera has been collected there (no */{RECORD_NAME}); give the folder that "
+            f"{run}: {wanted} has been collected there (no */{RECORD_NAME}); give the folder that "
             "was given to collect"
         )
     records: dict[str, CameraRecord | str] = {}
@@ -126,6 +134,9 @@ def solve(
     for folder in folders:
         try:
             record = CameraRecord.load(folder)
+        except FileNotFoundError:
+            records[folder.name] = f"{folder}: nothing was collected there (no {RECORD_NAME})"
+            continue
         except (OSError, ValueError) as error:
             records[folder.name] = str(error)
             continue
@@ -137,13 +148,13 @@ def solve(
             except (OSError, ValueError) as error:
                 unreadable[folder.name, index] = str(error)
     fits = _fit(items, powers, options)
-    cameras = {
+    results = {
         name: CameraResult((), None, record)
         if isinstance(record, str)
         else _camera_result(run, name, record, fits, unreadable, offsets)
         for name, record in records.items()
     }
-    summary = Summary(cameras)
+    summary = Summary(results)
     _save(summary, run / (SUMMARY_NAME if offsets else SUMMARY_NAME_WITHOUT))
     return summary
 
@@ -160,9 +171,7 @@ def _load_item(folder: Path, record: CameraRecord, index: int, offsets: bool) ->
             f"{record.image_size[0]}x{record.image_size[1]}; collect it again"
         )
     if not offsets:
-        patterns = LinePatterns(
-            patterns.points, patterns.mask, patterns.image_size, None, patterns.sigma
-        )
+        patterns = patterns.without_offsets()
     center = record.principal_point or [(width - 1) / 2, (height - 1) / 2]
     return _Item(folder.name, index, patterns, (center[0], center[1]), record.pixel_aspect)
 
@@ -219,7 +228,16 @@ def _camera_result(
         fit = fits.get((name, index))
         if fit is None:
             reason = unreadable.get((name, index)) or zoom.error or "no line was collected"
-            zooms.append(ZoomResult(zoom.magnification, zoom.zoom_units, False, None, error=reason))
+            zooms.append(
+                ZoomResult(
+                    nominal_zoom=zoom.nominal_zoom,
+                    magnification=zoom.magnification,
+                    zoom_units=zoom.zoom_units,
+                    ok=False,
+                    status=None,
+                    error=reason,
+                )
+            )
             continue
         zooms.append(_zoom_result(zoom, fit))
         knots.append(_knot(zoom, fit))
@@ -253,6 +271,7 @@ def _zoom_result(zoom: ZoomRecord, fit: Fit) -> ZoomResult:
     error = None if status is Status.OK else status.value
     center = fit.lens.center[0].tolist()
     return ZoomResult(
+        nominal_zoom=zoom.nominal_zoom,
         magnification=zoom.magnification,
         zoom_units=zoom.zoom_units,
         ok=status in _USABLE and zoom.error is None,
@@ -273,6 +292,7 @@ def _knot(zoom: ZoomRecord, fit: Fit) -> Knot:
         fit.lens,
         status=fit.status[0].name,
         usable=fit.status[0] in _USABLE,
+        nominal_zoom=zoom.nominal_zoom,
         zoom_units=zoom.zoom_units,
         rms_px=_number(fit.rms_px),
         gain=_number(fit.gain),
@@ -295,7 +315,7 @@ def _save(summary: Summary, path: Path) -> None:
             name: {"ok": camera.ok, **asdict(camera)} for name, camera in summary.cameras.items()
         },
     }
-    write_whole(path, json.dumps(stored, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_whole(path, json.dumps(without_nan(stored), indent=2, ensure_ascii=False) + "\n")
 
 
 def _number(value: torch.Tensor | None) -> float | None:

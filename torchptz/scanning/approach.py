@@ -9,12 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchptz.cameras import CameraError, MotionError, Pose
-from torchptz.geometry import pan_tilt_from_ray, ray_through_pixel
+from torchptz.cameras import CameraError, Capabilities, MotionError, Pose
+from torchptz.geometry import pan_tilt_from_ray, project, ray_through_pixel, to_camera
 from torchptz.scanning.observation import Observation, Observer
 
 _USUAL_FOV = math.radians(55)  # of a PTZ lens at its wide end, where the device does not say
-_PROBE = 0.08  # of the field of view: the move that shows signs and scale
+_PROBE = 0.08  # of the field of view: the move of the picture that shows signs and scale
+_STEEPEST = 0.1  # cos(tilt) below which the probe's pan grows no further
+_FOLLOWS = 0.3  # of the expected shift: less is no following
+_TELLING = 2.0  # px; an axis that moves the feature less, straight above or below, tells nothing
+_FOCAL_ROUNDS = 8
 _LADDER = 2.2  # magnification between two looks on the way in
 _SEARCH_STEP = 0.75  # of the field of view between neighbouring views of a search
 _SEARCH_RINGS = 2
@@ -64,7 +68,7 @@ def approach(
         here = camera.position()
         direction = (here.pan, here.tilt)
     seen = _find(observer, direction, widest, fov, image_size[1] / image_size[0])
-    focal, seen = _probe(observer, seen, focal, fov, middle)
+    focal, seen = _probe(observer, seen, focal, fov, middle, pixel_aspect)
 
     magnification = 1.0
     while True:
@@ -130,21 +134,23 @@ def _spiral(rings: int) -> Iterator[tuple[int, int]]:
 
 
 def _probe(
-    observer: Observer, seen: Observation, focal: float, fov: float, middle: np.ndarray
+    observer: Observer,
+    seen: Observation,
+    focal: float,
+    fov: float,
+    middle: np.ndarray,
+    aspect: float,
 ) -> tuple[float, Observation]:
     """Turn both axes a little; the picture must follow. Returns the focal length it shows."""
     camera = observer.camera
-    away = np.asarray(seen.pixel) - middle
-    # Towards the middle: panning left (> 0) moves the picture right, tilting down moves it up.
-    move = _PROBE * fov * np.array([-1.0 if away[0] > 0 else 1.0, 1.0 if away[1] > 0 else -1.0])
-    pan, tilt = seen.commanded.pan + move[0], seen.commanded.tilt + move[1]
-    pose = Pose(*camera.capabilities.nearest_reachable(pan, tilt), seen.commanded.zoom)
-    expected = np.asarray(seen.pixel) + focal * move * np.array([1.0, -1.0])
+    at = np.asarray(seen.pixel)
+    pose = _probing(camera.capabilities, seen, at - middle, fov)
+    expected = _shift(seen, pose, middle, focal, aspect)
     probed = observer.look(
         pose,
         "locate",
-        near=tuple(np.asarray(seen.pixel)),
-        search_radius=float(3 * np.linalg.norm(expected - np.asarray(seen.pixel))),
+        near=tuple(at),
+        search_radius=float(3 * np.linalg.norm(expected)),
         expected_radius=seen.radius,
     )
     if not probed.found:
@@ -152,40 +158,73 @@ def _probe(
             f"camera {camera.name}: the feature was lost after a small move ({probed.reason}); "
             "keep it clear of other bright things"
         )
-    turned = np.array(
-        [
-            math.remainder(probed.read_after.pan - seen.read_after.pan, 2 * math.pi),
-            -(probed.read_after.tilt - seen.read_after.tilt),
-        ]
-    )
-    shifted = np.asarray(probed.pixel) - np.asarray(seen.pixel)
-    for name, shift, turn in zip(("pan", "tilt"), shifted, turned, strict=True):
-        if abs(shift) < 0.3 * focal * abs(turn):
+    before, after = seen.read_after, probed.read_after
+    shifted = np.asarray(probed.pixel) - at
+    # What each axis alone does to the picture; away from the horizon the pan also turns it.
+    turns = {
+        "pan": Pose(after.pan, before.tilt, before.zoom),
+        "tilt": Pose(before.pan, after.tilt, before.zoom),
+    }
+    shifts = {axis: _shift(seen, turn, middle, focal, aspect) for axis, turn in turns.items()}
+    shifts = {axis: shift for axis, shift in shifts.items() if np.hypot(*shift) > _TELLING}
+    columns = np.stack([*shifts.values(), np.zeros(2)], -1)
+    followed = np.linalg.lstsq(columns, shifted, rcond=None)[0]
+    for (axis, shift), share in zip(shifts.items(), followed[:-1], strict=True):
+        if abs(share) < _FOLLOWS:
             raise MotionError(
-                f"camera {camera.name}: the picture does not follow the {name} axis (it reads a "
-                f"turn of {math.degrees(abs(turn)):.2f}°, the feature moved {shift:.1f} px); is "
-                "the picture rotated, or frozen?"
+                f"camera {camera.name}: the picture does not follow the {axis} axis (by its "
+                f"reading the feature should have moved {np.hypot(*shift):.1f} px with it, it "
+                f"moved {abs(share) * np.hypot(*shift):.1f} px); is the picture rotated, or frozen?"
             )
-        if shift * turn < 0:
+        if share < 0:
             raise MotionError(
-                f"camera {camera.name}: the picture moves against the {name} axis; set "
-                f"{name}_sign to the other sign in its configuration"
+                f"camera {camera.name}: the picture moves against the {axis} axis; set "
+                f"{axis}_sign to the other sign in its configuration"
             )
-    measured = float(np.abs(shifted).sum() / np.abs(turned).sum())
-    # The tangent's curvature and the wide end's distortion keep this within some per cent.
-    return measured, probed
+    # The shift is nearly proportional to the focal length. The wide end's distortion keeps the
+    # result within some per cent.
+    for _ in range(_FOCAL_ROUNDS):
+        expected = _shift(seen, after, middle, focal, aspect)
+        focal *= float(shifted @ expected / (expected @ expected))
+    return focal, probed
+
+
+def _probing(can: Capabilities, seen: Observation, away: np.ndarray, fov: float) -> Pose:
+    """A pose beside that of a look which moves its feature towards the middle of the picture."""
+    here = seen.commanded
+    move = _PROBE * fov
+    # Panning left (> 0) moves the picture right by the move times cos(tilt), tilting down moves it
+    # up.
+    pan_move = math.copysign(move / max(math.cos(here.tilt), _STEEPEST), -away[0])
+    tilt_move = math.copysign(move, away[1])
+    # At a limit there is only the way back.
+    if not can.pan_limits[0] <= here.pan + pan_move <= can.pan_limits[1]:
+        pan_move = -pan_move
+    if not can.tilt_limits[0] <= here.tilt + tilt_move <= can.tilt_limits[1]:
+        tilt_move = -tilt_move
+    return Pose(*can.nearest_reachable(here.pan + pan_move, here.tilt + tilt_move), here.zoom)
+
+
+def _shift(
+    seen: Observation, to: Pose, middle: np.ndarray, focal: float, aspect: float
+) -> np.ndarray:
+    """(2,) px by which a seen feature moves in the picture when the head turns to a pose."""
+    ray = _ray(seen, middle, focal, aspect)
+    pose = torch.tensor([to.pan, to.tilt], dtype=torch.float64)
+    image = project(to_camera(ray, *pose)).numpy()
+    return middle + focal * np.array([1.0, aspect]) * image - np.asarray(seen.pixel)
 
 
 def _centring(
     seen: Observation, middle: np.ndarray, focal: float, aspect: float
 ) -> tuple[float, float]:
     """Pan and tilt that bring a seen feature to the middle of the picture."""
-    away = (np.asarray(seen.pixel) - middle) / (focal * np.array([1.0, aspect]))
-    reading = seen.read_after
-    ray = ray_through_pixel(
-        torch.tensor(reading.pan, dtype=torch.float64),
-        torch.tensor(reading.tilt, dtype=torch.float64),
-        torch.from_numpy(away),
-    )
-    pan, tilt = pan_tilt_from_ray(ray)
+    pan, tilt = pan_tilt_from_ray(_ray(seen, middle, focal, aspect))
     return float(pan), float(tilt)
+
+
+def _ray(seen: Observation, middle: np.ndarray, focal: float, aspect: float) -> torch.Tensor:
+    """(3,) world ray of a seen feature, as far as the lens is known."""
+    away = (np.asarray(seen.pixel) - middle) / (focal * np.array([1.0, aspect]))
+    reading = torch.tensor([seen.read_after.pan, seen.read_after.tilt], dtype=torch.float64)
+    return ray_through_pixel(*reading, torch.from_numpy(away))

@@ -36,7 +36,7 @@ def reachable_near(
     Returns:
         pan, tilt (N, S) rad, on the grid. Two asked poses may share a reachable one.
 
-    Source: paper.md, 4.10 ("choose reachable ones close to the line").
+    Not in the paper, whose poses are rounded by the head.
     """
     reach = torch.arange(-_REACH, _REACH + 1, dtype=pan.dtype, device=pan.device)
     moves = torch.cartesian_prod(reach, reach)

@@ -92,7 +92,7 @@ def plan_lines(
     Returns:
         LinePlan, lines from the centre outwards.
 
-    Source: paper, section 1; grid after paper.md, 4.10.
+    Source: paper, section 1; the choice of poses on the head's grid is ours.
     """
     pp = torch.from_numpy(view.principal_point)
     focal = view.focal_lengths
@@ -166,11 +166,12 @@ def scan_pattern(
         for step in plan.mask[line].nonzero()[:, 0].tolist():
             target = (float(plan.pan[line, step]), float(plan.tilt[line, step]))
             ideal = plan.ideal[line, step].numpy()
-            expected = predictor.predict(ideal)
             radius = predictor.search_radius(ideal)
             # Poses whose feature would be cut by the border are not worth a move; what could be
             # either is looked at.
-            if target == last or not predictor.in_picture(expected, view.margin - 0.5 * radius):
+            if target == last or not predictor.in_picture(
+                predictor.predict(ideal), view.margin - 0.5 * radius
+            ):
                 continue
             last = target
             seen = observer.look(
@@ -178,15 +179,17 @@ def scan_pattern(
                 "line",
                 zoom_index=zoom_index,
                 group=first_line + line,
-                near=tuple(expected),
+                near=lambda at: tuple(predictor.predict(_ideal(view, ray, at.pan, at.tilt))),
                 search_radius=radius,
                 expected_radius=view.radius,
             )
+            # A head that stopped beside its target shows the feature where its reading says.
+            ideal = _ideal(view, ray, _mean_pan(seen), _mean_tilt(seen))
             if seen.found:
                 misses = 0
                 predictor.learn(ideal, np.asarray(seen.pixel))
                 found.append(seen)
-            elif predictor.in_picture(expected, view.margin + radius):
+            elif predictor.in_picture(predictor.predict(ideal), view.margin + radius):
                 misses += 1
                 if misses >= _MOST_MISSES:
                     raise FeatureLost(
@@ -201,9 +204,7 @@ def scan_pattern(
 
 def _scanned(found: list[Observation], plane: Tensor, ray: Tensor, view: View) -> ScannedLine:
     pan = torch.tensor([_mean_pan(one) for one in found], dtype=torch.float64)
-    tilt = torch.tensor(
-        [(one.read_before.tilt + one.read_after.tilt) / 2 for one in found], dtype=torch.float64
-    )
+    tilt = torch.tensor([_mean_tilt(one) for one in found], dtype=torch.float64)
     beside = plane_distance(plane[None], ray, pan[None], tilt[None])[0]
     return ScannedLine(
         points=np.array([one.pixel for one in found]),
@@ -212,7 +213,18 @@ def _scanned(found: list[Observation], plane: Tensor, ray: Tensor, view: View) -
     )
 
 
+def _ideal(view: View, ray: Tensor, pan: float, tilt: float) -> np.ndarray:
+    """(2,) px where an undistorted picture shows the feature at a pose."""
+    pose = torch.tensor([pan, tilt], dtype=torch.float64)
+    image = project(to_camera(ray, *pose)).numpy()
+    return view.principal_point + view.focal_lengths.numpy() * image
+
+
 def _mean_pan(one: Observation) -> float:
     """Mean of both readings, on the circle."""
     before, after = one.read_before.pan, one.read_after.pan
     return before + math.remainder(after - before, 2 * math.pi) / 2
+
+
+def _mean_tilt(one: Observation) -> float:
+    return (one.read_before.tilt + one.read_after.tilt) / 2

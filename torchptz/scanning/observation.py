@@ -20,10 +20,17 @@ _STILL_PX = 0.5  # the feature's largest move between two pictures of a head at 
 # A head that has not arrived and whose readings do not change is given this long to (re)start.
 _PATIENCE_S = 2.0
 _THERE_QUANTA = 0.6
-# A head that stops beside its target is at rest if it stays; until then it may be creeping there.
-_BESIDE_QUANTA = 1.5
-_BESIDE_S = 0.3
+# A head that stops beside its target is good enough: its reading says where it is. It is at rest if
+# it stays; until then it may be creeping there, or, where it was not seen to move, not yet off.
+_BESIDE_QUANTA = 5.1
+_BESIDE_S = 0.6
+_NOT_OFF_S = 1.0
+# Two readings closer than this are one: at rest a reading may flicker by a count.
+_FLICKER_QUANTA = 1.1
 _ZOOM_ARRIVAL = 0.003  # of the zoom range
+_ZOOM_FLICKER = 0.0005  # of the zoom range
+# A continuous axis has no quantum; its readings are good to about this.
+_FINEST = 1e-4  # rad
 
 
 class Stopped(Exception):
@@ -60,8 +67,9 @@ class Observation:
 class Observer:
     """Moves a camera, waits until it is at rest and looks for the feature.
 
-    What a device says of its own motion is not trusted: the head is at rest when two readings
-    agree, it is where it was sent, and two pictures in a row show the same.
+    What a device says of its own motion is not trusted: the head is at rest when its readings
+    agree to a quantum, it is where it was sent or stays within 5 quanta of that, and two pictures
+    in a row show the same.
 
     Args:
         camera: connected camera.
@@ -89,7 +97,7 @@ class Observer:
         """Send the head to a pose and wait until its readings are stable there.
 
         Returns:
-            The reading.
+            The reading, within about 5 quanta of the pose on either axis.
 
         Raises:
             MotionError: it did not move, stopped elsewhere or never came to rest.
@@ -99,27 +107,27 @@ class Observer:
         self.camera.move(pose)
         # Time counts from here: a camera that is slow to reply has not begun to move before.
         started = changed = time.monotonic()
-        first = previous = None
+        first = anchor = None  # anchor: the reading that later ones are the same as
         while True:
             if self._stop.is_set():
                 raise Stopped
             reading = self.camera.position()
             first = first or reading
             now = time.monotonic()
-            if previous is None or not self._same(reading, previous):
-                changed = now
-            elif self._arrived(reading, pose, now - changed):
+            late = anchor is not None and now - started > self._timeout
+            if anchor is None or not self._same(reading, anchor):
+                anchor, changed = reading, now
+            elif self._arrived(reading, pose, now - changed, self._same(reading, first)):
                 return reading
-            late = previous is not None and now - started > self._timeout
             # Two equal readings alone show nothing: a slow head's are whole quanta.
             if now - changed > (min(_PATIENCE_S, self._timeout / 2) if late else _PATIENCE_S):
-                raise MotionError(self._not_there(pose, reading, moved=reading != first))
+                moved = not self._same(reading, first)
+                raise MotionError(self._not_there(pose, reading, moved))
             if late:
                 raise MotionError(
                     f"{self._name}: the head was still moving {self._timeout:g} s after a move; "
                     "is a tour or another user driving it? (timing.settle_timeout_s)"
                 )
-            previous = reading
             time.sleep(self._poll)
 
     def look(
@@ -129,7 +137,7 @@ class Observer:
         *,
         zoom_index: int = -1,
         group: int = 0,
-        near: tuple[float, float] | None = None,
+        near: tuple[float, float] | Callable[[Pose], tuple[float, float]] | None = None,
         search_radius: float | None = None,
         expected_radius: float | None = None,
     ) -> Observation:
@@ -138,7 +146,8 @@ class Observer:
         Args:
             pose: where to go.
             purpose, zoom_index, group: written down with the observation.
-            near, search_radius, expected_radius: px, see `detect_ball`.
+            near, search_radius, expected_radius: px, see `detect_ball`. near may be a function of
+                the reading, for a head that stops beside its target.
 
         Returns:
             Observation, also of a feature that was not found.
@@ -153,7 +162,10 @@ class Observer:
                 raise Stopped
             frame = self.camera.snapshot()
             seen = detect_ball(
-                frame, near=near, search_radius=search_radius, expected_radius=expected_radius
+                frame,
+                near=near(before) if callable(near) else near,
+                search_radius=search_radius,
+                expected_radius=expected_radius,
             )
             if last is None or not _agree(last, (frame, seen)):
                 last = (frame, seen)
@@ -213,33 +225,38 @@ class Observer:
             radius=radius,
             quality=quality,
             reason=reason,
-            rest_rule="readings agree at the target, pictures agree",
+            rest_rule=self._rest_rule(before, pose),
             taken_at=time.time(),
         )
         self._record(observation)
         return observation
 
     def _same(self, a: Pose, b: Pose) -> bool:
-        """Whether two readings are the same to within a small part of the quanta."""
-        can = self.camera.capabilities
-        pan = abs(math.remainder(a.pan - b.pan, 2 * math.pi))
-        return (
-            pan <= 0.1 * max(can.pan_quantum, 1e-6)
-            and abs(a.tilt - b.tilt) <= 0.1 * max(can.tilt_quantum, 1e-6)
-            and a.zoom == b.zoom
-        )
+        """Whether two readings are the same but for a flicker."""
+        quanta, zoom = self._apart(a, b)
+        return quanta <= _FLICKER_QUANTA and zoom <= _ZOOM_FLICKER
 
-    def _arrived(self, reading: Pose, pose: Pose, unchanged_s: float) -> bool:
-        """Whether a reading is near enough to a pose, after it did not change for a time."""
-        quanta = _BESIDE_QUANTA if unchanged_s > _BESIDE_S else _THERE_QUANTA
+    def _arrived(self, reading: Pose, pose: Pose, unchanged_s: float, as_first: bool) -> bool:
+        """Whether a reading is near enough to a pose, after it did not change for a time.
+
+        as_first: it still is the one right after the command.
+        """
+        beside = unchanged_s > (_NOT_OFF_S if as_first else _BESIDE_S)
+        quanta, zoom = self._apart(reading, pose)
+        return quanta <= (_BESIDE_QUANTA if beside else _THERE_QUANTA) and zoom <= _ZOOM_ARRIVAL
+
+    def _apart(self, a: Pose, b: Pose) -> tuple[float, float]:
+        """Quanta on the axis where two poses differ more, and the share of the zoom range."""
         can = self.camera.capabilities
-        pan = abs(math.remainder(reading.pan - pose.pan, 2 * math.pi))
+        pan = abs(math.remainder(a.pan - b.pan, 2 * math.pi)) / max(can.pan_quantum, _FINEST)
+        tilt = abs(a.tilt - b.tilt) / max(can.tilt_quantum, _FINEST)
         zoom_range = can.zoom_limits[1] - can.zoom_limits[0]
-        return (
-            pan <= quanta * max(can.pan_quantum, 1e-4)
-            and abs(reading.tilt - pose.tilt) <= quanta * max(can.tilt_quantum, 1e-4)
-            and abs(reading.zoom - pose.zoom) <= _ZOOM_ARRIVAL * zoom_range
-        )
+        return max(pan, tilt), abs(a.zoom - b.zoom) / zoom_range
+
+    def _rest_rule(self, before: Pose, pose: Pose) -> str:
+        quanta, _ = self._apart(before, pose)
+        where = "at the target" if quanta <= _THERE_QUANTA else f"{quanta:.1f} quanta beside it"
+        return f"readings agree to a quantum, {where}; pictures agree"
 
     def _not_there(self, pose: Pose, reading: Pose, moved: bool) -> str:
         def text(p: Pose) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -35,6 +36,7 @@ def estimate_ray(
     pixels: Tensor,
     principal_point: Tensor,
     focal_length: float,
+    focal_length_sigma: float = math.inf,
     principal_point_sigma: float = 0.0,
     pixel_aspect: float = 1.0,
 ) -> FeatureRay:
@@ -49,7 +51,9 @@ def estimate_ray(
         pan, tilt: (N,) rad, readings, N >= 3, not all the same.
         pixels: (N, 2) px, where the feature was seen.
         principal_point: (2,) px.
-        focal_length: px, start.
+        focal_length: px, start, and what is known of it beforehand ...
+        focal_length_sigma: ... to so many px. A few quanta at the longest zoom tell f exactly where
+            the readings are true, and badly where the head has play: then the start counts more.
         principal_point_sigma: px, its error moves the ray by as much over f.
         pixel_aspect: width over height of a pixel; f is in px along x.
 
@@ -59,7 +63,9 @@ def estimate_ray(
     Raises:
         ValueError: fewer than 3 poses, or all alike.
 
-    Source: paper, section 1; averaging and displacement correction after paper.md, 4.11.
+    Source: paper, section 1, for the ray; averaging, displacement correction and the joint focal
+    length are ours: at the wide end an error of the ray goes straight into the centre of the
+    distortion, and no residual shows it.
     """
     if len(pan) < 3 or float(pan.std() + tilt.std()) == 0:
         raise ValueError("the ray needs at least 3 different poses")
@@ -82,12 +88,16 @@ def estimate_ray(
     left = residual(state)
     variance = float(left.square().sum() / max(left.numel() - 3, 1))
     covariance = variance * torch.linalg.inv(columns.T @ columns)
+    # Taking in what was known of f beforehand moves the ray along with it (a Kalman update).
+    gain = covariance[:, 2] / (covariance[2, 2] + focal_length_sigma**2)
+    state = state + gain * (focal_length - state[2])
+    covariance = covariance - gain[:, None] * covariance[2]
     ray_variance = float(covariance[:2, :2].diagonal().max())
     systematic = principal_point_sigma / float(state[2])
     return FeatureRay(
         ray=ray_from_pan_tilt(state[0], state[1]),
         ray_sigma=(ray_variance + systematic**2) ** 0.5,
         focal_length=float(state[2]),
-        focal_length_sigma=float(covariance[2, 2].sqrt()),
+        focal_length_sigma=float(covariance[2, 2].clamp_min(0).sqrt()),
         rms_px=variance**0.5,
     )

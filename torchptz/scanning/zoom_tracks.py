@@ -9,12 +9,14 @@ import numpy as np
 import torch
 
 from torchptz.cameras import Camera, Pose
-from torchptz.geometry import pan_tilt_to_see
+from torchptz.geometry import pan_tilt_to_see, project, to_camera
 from torchptz.scanning.observation import Observation, Observer
 
 _LEVELS = 7  # at least, spread evenly over the log of magnification
 _CLEARANCE = 6  # px between the feature's rim and the picture's border
 _PINCUSHION = 0.02  # of the distance from the middle: the most that a long zoom pushes outwards
+
+_INWARDS = (1.0, 0.8, 0.6)  # of the way to the border, where a track may begin
 
 
 @dataclass(frozen=True)
@@ -76,32 +78,58 @@ def scan_tracks(
     middle = (np.asarray(image_size, dtype=float) - 1) / 2
     # The pose is rounded to the head's grid, which moves the feature by up to half a quantum.
     quanta = np.array([camera.capabilities.pan_quantum, camera.capabilities.tilt_quantum])
-    rounding = focal_length * np.array([1, pixel_aspect]) * quanta / 2
+    focal = focal_length * np.array([1, pixel_aspect])
+    rounding = focal * quanta / 2
     reach = (middle - radius - _CLEARANCE - rounding) / (1 + _PINCUSHION)
     longest = levels[-1]
     points = np.full((count, len(levels), 2), np.nan)
     sigma = np.full((count, len(levels)), np.nan)
     radii = np.full((count, len(levels)), np.nan)
-    for track, direction in enumerate(_around(count)):
-        pose = _pose(camera, ray, direction * reach / (focal_length * np.array([1, pixel_aspect])))
-        start: Observation | None = None
-        for level in reversed(range(len(levels))):
-            zoom = levels[level]
-            ratio = camera.magnification(zoom) / camera.magnification(longest)
-            away = direction * reach if start is None else np.asarray(start.pixel) - middle
-            # Nominal magnifications are some per cent off, the principal point some px.
+
+    def at_longest(at: Pose) -> np.ndarray:
+        pose = torch.tensor([at.pan, at.tilt], dtype=torch.float64)
+        return middle + focal * project(to_camera(ray, *pose)).numpy()
+
+    def start(track: int, direction: np.ndarray) -> Observation | None:
+        # A head with play, or an axis that is off, misses by more than its rounding: where the
+        # border cuts the feature, begin farther in.
+        for inwards in _INWARDS:
+            pose = _pose(camera, ray, direction * reach * inwards / focal)
+            if not np.isfinite(pose).all():
+                continue  # straight above or below the camera some places are out of reach
             seen = observer.look(
-                Pose(pose[0], pose[1], zoom),
+                Pose(*pose, longest),
                 "track",
-                zoom_index=level,
+                zoom_index=len(levels) - 1,
                 group=track,
-                near=tuple(middle + away * ratio),
-                search_radius=20 + 0.25 * float(np.linalg.norm(away)) * ratio,
-                expected_radius=radius * ratio,
+                # The head may have stopped beside its target: its reading says where.
+                near=lambda at: tuple(at_longest(at)),
+                search_radius=20 + 0.25 * float(np.linalg.norm(reach)),
+                expected_radius=radius,
             )
-            if start is None and not seen.found:
-                break  # cut by the border, or the pose was rounded too far: no track from here
-            start = start or seen
+            if seen.found:
+                return seen
+        return None
+
+    for track, direction in enumerate(_around(count)):
+        seen = start(track, direction)
+        if seen is None:
+            continue
+        away = np.asarray(seen.pixel) - middle
+        pose = seen.commanded
+        for level in reversed(range(len(levels))):
+            if level < len(levels) - 1:
+                ratio = camera.magnification(levels[level]) / camera.magnification(longest)
+                # Nominal magnifications are some per cent off, the principal point some px.
+                seen = observer.look(
+                    Pose(pose.pan, pose.tilt, levels[level]),
+                    "track",
+                    zoom_index=level,
+                    group=track,
+                    near=tuple(middle + away * ratio),
+                    search_radius=20 + 0.25 * float(np.linalg.norm(away)) * ratio,
+                    expected_radius=radius * ratio,
+                )
             if seen.found:
                 points[track, level], sigma[track, level] = seen.pixel, seen.sigma
                 radii[track, level] = seen.radius

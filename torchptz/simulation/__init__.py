@@ -4,6 +4,7 @@ from .camera import SimulatedCamera
 from .comparison import compare_lens
 from .config import CameraConfig, SimulationConfig, SimulationError
 from .fleet import SimulatedFleet, serve
+from .process import serve_in_process
 from .truth import CameraTruth, TruthComparison, load_truth, write_truth
 from .view import HeadPose
 
@@ -19,5 +20,6 @@ __all__ = [
     "compare_lens",
     "load_truth",
     "serve",
+    "serve_in_process",
     "write_truth",
 ]

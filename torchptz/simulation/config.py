@@ -13,6 +13,9 @@ NonNegativeFloat = Annotated[float, Field(ge=0)]
 Pair = tuple[float, float]
 
 
+_ASIDE_DEG = 55.0
+
+
 class SimulationError(RuntimeError):
     """A simulated fleet cannot be configured or started; the message says why and the way out."""
 
@@ -47,7 +50,7 @@ class BallConfig(_Section):
 class BoardConfig(_Section):
     """A plane checkerboard that faces the camera, turned by three angles about its centre."""
 
-    pan_deg: float = 35.0
+    pan_deg: float = 0.0  # left out: _ASIDE_DEG beside the ball
     tilt_deg: float = 12.0
     distance_m: PositiveFloat = 6.0
     squares: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3)]] = (11, 8)
@@ -74,6 +77,16 @@ class SceneConfig(_Section):
     highlights: list[HighlightConfig] | None = None  # None: three, drawn from the seed
     text: str | None = None  # written into the picture's corner, as cameras do
     plain_background: Annotated[float, Field(ge=0, le=150)] | None = None  # DN; None: texture
+
+    @model_validator(mode="after")
+    def _board_beside_ball(self) -> SceneConfig:
+        # A board is nearer than the ball and would hide it: unless it is told where to stand, it
+        # keeps aside.
+        board = self.board
+        if board is not None and "pan_deg" not in board.model_fields_set:
+            aside = self.ball.pan_deg + (_ASIDE_DEG if self.ball.pan_deg < 90 else -_ASIDE_DEG)
+            object.__setattr__(self, "board", board.model_copy(update={"pan_deg": aside}))
+        return self
 
 
 class HeadConfig(_Section):

@@ -1,0 +1,104 @@
+"""Pictures of a simulated camera and of what was collected with it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+
+from torchptz.cameras import CameraError, Pose, open_camera
+from torchptz.fleet.config import CameraConfig
+from torchptz.fleet.journal import JOURNAL_NAME, read_journal
+from torchptz.fleet.records import CameraRecord
+from torchptz.lens import RadialLens
+from torchptz.patterns import LinePatterns
+from torchptz.report.figures import draw_pattern
+from torchptz.scanning.observation import Observer
+from torchptz.scanning.stillness import pictures_still
+from torchptz.simulation import SimulationConfig
+
+_STILL_PX = 0.3
+_MOST_PICTURES = 40
+
+
+def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.ndarray | None:
+    """A camera's checkerboard at the widest zoom, with the head at rest.
+
+    Returns:
+        (H, W, 3) uint8 BGR; None where the camera has no board.
+
+    Raises:
+        CameraError: the camera failed; says why.
+    """
+    board = next(one for one in simulated.cameras if one.name == config.name).scene.board
+    if board is None:
+        return None
+    with ExitStack() as undo:
+        camera = open_camera(
+            config.dialect,
+            config.name,
+            config.address,
+            config.resolve_credentials(),
+            **config.driver_options(),
+        )
+        undo.callback(camera.close)
+        undo.callback(camera.restore)
+        camera.prepare()
+        can, timing = camera.capabilities, config.timing
+        pose = can.nearest_reachable(math.radians(board.pan_deg), math.radians(board.tilt_deg))
+        observer = Observer(
+            camera,
+            lambda _: None,
+            threading.Event(),
+            timing.settle_timeout_s,
+            timing.poll_interval_s,
+        )
+        observer.go(Pose(*pose, can.zoom_limits[0]))
+        picture = camera.snapshot()
+        for _ in range(_MOST_PICTURES):
+            last, picture = picture, camera.snapshot()
+            if pictures_still(last, picture, _STILL_PX):
+                return picture
+    raise CameraError(
+        f"camera {config.name}: the board's picture does not come to rest in {_MOST_PICTURES} "
+        "pictures; is something moving in it?"
+    )
+
+
+def draw_collected(folder: Path, zoom_index: int = 0) -> Figure | None:
+    """The zoom tracks of a camera and its lines at one zoom.
+
+    Args:
+        folder: the camera's, in a run.
+        zoom_index: of the record's zooms.
+
+    Returns:
+        Figure; None where there is no principal point or no line yet.
+    """
+    record = CameraRecord.load(folder)
+    if record.principal_point is None or len(record.zooms) <= zoom_index:
+        return None
+    zoom = record.zooms[zoom_index]
+    if zoom.patterns is None:
+        return None
+    tracks: dict[int, list[tuple[float, float]]] = {}
+    for seen in read_journal(folder / JOURNAL_NAME):
+        if seen.purpose == "track" and seen.found:
+            tracks.setdefault(seen.group, []).append(seen.pixel)
+    return draw_pattern(
+        [np.array(track) for track in tracks.values()],
+        record.principal_point,
+        LinePatterns.load(folder / zoom.patterns).to_lists()[0],
+        record.image_size,
+    )
+
+
+def undistortion(lens: RadialLens) -> Callable[[np.ndarray], np.ndarray]:
+    """A lens (batch of one) as a function of points (N, 2) px, as `compare_lens` wants it."""
+    return lambda points: lens.undistort(torch.from_numpy(points)[None])[0].numpy()
