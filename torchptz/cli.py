@@ -1,7 +1,7 @@
 """The command ``torchptz``. Every command is a library function; this file only talks.
 
 Exit codes: 0 everything succeeded; 1 a part failed, the rest is there; 2 nothing succeeded, or the
-command was called wrongly.
+command was called wrongly; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -57,6 +57,10 @@ class _Commands(click.Group):
     def invoke(self, ctx: click.Context):
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            # Collecting has sent every head back by now, and what was collected is on disk.
+            click.echo("torchptz: interrupted; what was finished is kept", err=True)
+            ctx.exit(130)
         except (ValueError, OSError, RuntimeError) as error:
             if not _is_expected(error):
                 raise
@@ -80,7 +84,7 @@ def main(verbose: int) -> None:
     """Pan-tilt-zoom cameras that calibrate their own lenses.
 
     Exit codes: 0 everything succeeded; 1 a part failed, the rest is there; 2 nothing succeeded, or
-    the command was called wrongly.
+    the command was called wrongly; 130 interrupted.
     """
     level = {0: logging.WARNING, 1: logging.INFO}.get(verbose, logging.DEBUG)
     # The root logger stays at warnings: libraries have much to say about themselves.
