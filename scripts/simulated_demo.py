@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import yaml
-from paper.pictures import draw_collected, photograph_board, undistortion
 from rich.console import Console
 from rich.table import Table
+from simulated_pictures import draw_collected, photograph_board, undistortion
 
 import torchptz as tp
 from torchptz.cameras import CameraError

@@ -410,3 +410,13 @@ class TestSimulate:
         assert process.returncode == 0
         assert output == f"gate: {addresses['gate']}\n"
         assert "Traceback" not in errors
+
+
+def test_an_interrupt_says_what_is_kept_and_has_a_code_of_its_own(tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchptz.fleet.solve.solve", interrupted)
+    result = CliRunner().invoke(main, ["solve", str(tmp_path)])
+    assert result.exit_code == 130
+    assert "interrupted; what was finished is kept" in result.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,20 @@ _FARTHEST = 1e4
 _BISECTIONS = 80
 _NEWTON_STEPS = 100
 _SETTLED = 1e-15  # change of r, and what is left of the equation: rounding level
+
+
+def checked_powers(powers: Sequence[float] | Tensor) -> Tensor:
+    """(K,) powers of r in float64.
+
+    Raises:
+        ValueError: none, not a list, or not positive and increasing.
+    """
+    checked = torch.as_tensor(powers, dtype=torch.float64)
+    if checked.ndim != 1 or checked.numel() == 0:
+        raise ValueError(f"powers must be a list of at least one number, not {powers}")
+    if not bool((checked > 0).all() and (checked.diff() > 0).all()):
+        raise ValueError(f"powers must be positive and increasing numbers, not {powers}")
+    return checked
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +86,7 @@ class RadialLens(Batched):
                 )
             return tensor.expand(batch, *tail)
 
-        powers = torch.as_tensor(self.powers, dtype=torch.float64, device=device)
-        if powers.ndim != 1 or powers.numel() == 0:
-            raise ValueError("powers must be a list of at least one number")
-        if not bool((powers > 0).all()) or not bool((powers.diff() > 0).all()):
-            raise ValueError(f"powers must be positive and increasing, not {powers.tolist()}")
+        powers = checked_powers(self.powers).to(device)
         image_size = as_batch(self.image_size, "image_size", (2,))
         scale = image_size[:, 0] / 2 if self.scale is None else as_batch(self.scale, "scale", ())
         aspect = as_batch(self.pixel_aspect, "pixel_aspect", ())

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from simulated_pictures import draw_collected, photograph_board, undistortion
 
 from paper.device import Settings, fleet, simulation
-from paper.pictures import draw_collected, photograph_board, undistortion
 from torchptz.cameras import CameraError
 from torchptz.estimation import Fit, estimate
 from torchptz.estimation.fixed_point import iterate, line_variances

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from simulated_pictures import undistortion
 from torch import Tensor
 
 from paper.pattern import (
@@ -24,7 +25,6 @@ from paper.pattern import (
     noisy,
     scan,
 )
-from paper.pictures import undistortion
 from torchptz.estimation import estimate
 from torchptz.estimation.fixed_point import FixedPoint, iterate, line_variances
 from torchptz.estimation.problem import Problem

@@ -15,7 +15,7 @@ from torchptz.estimation.refinement import refine
 from torchptz.estimation.residuals import straightness
 from torchptz.estimation.status import Status, center_unobservable, judge
 from torchptz.estimation.uncertainty import estimate_uncertainty
-from torchptz.lens import RadialLens
+from torchptz.lens import RadialLens, checked_powers
 from torchptz.patterns import LinePatterns
 
 METHODS = ("lanz",)
@@ -73,11 +73,7 @@ def estimate(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
-    exponents = torch.as_tensor(powers, dtype=torch.float64)
-    rising = exponents.ndim == 1 and len(exponents) > 0 and bool((exponents.diff() > 0).all())
-    if not rising or exponents[0] <= 0:
-        raise ValueError(f"powers must be positive and increasing numbers, not {powers}")
-    problem = Problem.from_patterns(patterns, exponents, pixel_aspect)
+    problem = Problem.from_patterns(patterns, checked_powers(powers), pixel_aspect)
     start = (problem.image_size - 1) / 2 if center is None else center.to(problem.points)
     start = start.expand_as(problem.image_size)
     hold = torch.zeros(len(problem), dtype=torch.bool, device=start.device)

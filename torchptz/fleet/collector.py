@@ -153,11 +153,13 @@ class Collector:
             )
         pp, covariance = meeting.position[0], meeting.covariance[0]
         magnification, magnification_sigma = estimate_magnification(points, mask, pp[None])
+        # Levels that no track reached keep their nominal magnification.
+        nominal = torch.tensor([camera.magnification(level) for level in levels])
+        reached = magnification[0].isfinite() & (magnification[0] > 0)
+        levelled = torch.where(reached, magnification[0], nominal.double())
+        relative = (levelled / levelled[-1]).tolist()
         # The wide end's focal length, from the first moves, times the magnification just measured.
-        longest = float(magnification[0, -1])
-        if not longest > 0:
-            longest = camera.magnification(levels[-1])
-        known = found.focal_length * longest / camera.magnification(levels[-1])
+        known = found.focal_length * float(levelled[-1] / nominal[-1])
         pp_sigma = float(covariance.diagonal().max().sqrt())
         ray = self._ray(looks, pp, known, _FIRST_MOVES, pp_sigma)
         record.principal_point = pp.tolist()
@@ -168,26 +170,18 @@ class Collector:
 
         for index, zoom in enumerate(zooms):
             level = levels.index(zoom)
-            measured = float(magnification[0, level])
-            relative = float(magnification[0, level] / magnification[0, -1])
-            if not (measured > 0 and relative > 0):  # no track reached this level, or the widest
-                measured = camera.magnification(zoom)
-                relative = measured / camera.magnification(levels[-1])
-                spread = math.nan
-            else:
-                spread = float(magnification_sigma[0, level])
-            focal_length = ray.focal_length * relative
-            parts = (ray.focal_length_sigma / ray.focal_length, spread / measured, _TRACKS_BEND)
+            measured, focal_length = float(levelled[level]), ray.focal_length * relative[level]
+            spread = float(magnification_sigma[0, level]) if reached[level] else None
             zoom_record = ZoomRecord(
                 nominal_zoom=config.zooms[index],
                 zoom_units=zoom,
                 magnification=measured,
-                magnification_sigma=spread if math.isfinite(spread) else None,
+                magnification_sigma=spread,
                 focal_length_px=focal_length,
-                focal_length_sigma_px=focal_length * math.hypot(*parts)
-                if math.isfinite(spread)
-                else None,
             )
+            if spread is not None:
+                parts = (ray.focal_length_sigma / ray.focal_length, spread / measured, _TRACKS_BEND)
+                zoom_record.focal_length_sigma_px = focal_length * math.hypot(*parts)
             record.zooms.append(zoom_record)
             radius = tracks.radius[level]
             view = View(
@@ -196,7 +190,7 @@ class Collector:
                 focal_length=focal_length,
                 pixel_aspect=config.pixel_aspect,
                 zoom=zoom,
-                radius=float(radius if np.isfinite(radius) else found.radius * relative),
+                radius=float(radius if np.isfinite(radius) else found.radius * relative[level]),
             )
             self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
 
@@ -270,7 +264,13 @@ class Collector:
                 ),
                 found.pose.zoom,
             )
-            moved = found.focal_length * np.array([x * pan_step, -y * tilt_step])
+            # Away from the horizon a pan moves the picture by less than its angle.
+            moved = found.focal_length * np.array(
+                [
+                    x * pan_step * math.cos(found.pose.tilt),
+                    -y * tilt_step * self._config.pixel_aspect,
+                ]
+            )
             middle = (np.asarray(self._image_size) - 1) / 2
             seen = observer.look(
                 pose,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+
+from torchptz.files import whole_file
 
 # Told apart by colour-blind readers (Okabe and Ito).
 BLACK, GREY = "#000000", "#8c8c8c"
@@ -28,10 +29,8 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 140) -> None:
     path = Path(path)
     if path.suffix.lower() != ".png":
         raise ValueError(f"{path}: figures are written as .png")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, dpi=dpi, format="png")
-    os.replace(temporary, path)
+    with whole_file(path) as file:
+        figure.savefig(file, dpi=dpi, format="png")
 
 
 def new_figure(width: float, height: float) -> Figure:

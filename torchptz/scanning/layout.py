@@ -89,7 +89,7 @@ def _parallel(
     extent = corners @ normal
     axis_parallel = min(abs(direction[0]), abs(direction[1])) < 1e-9
     if axis_parallel:  # the outermost lines run along the box's edges
-        shares = torch.linspace(0, 1, count, dtype=torch.float64) if count > 1 else [0.5] * count
+        shares = torch.linspace(0, 1, count, dtype=torch.float64) if count != 1 else [0.5]
     else:  # oblique ones shrink to nothing at the corners: keep off these
         shares = (torch.arange(count, dtype=torch.float64) + 1) / (count + 1)
     lines = []
