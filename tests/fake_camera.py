@@ -44,6 +44,8 @@ class FakeCamera:
     capabilities: Capabilities = field(default_factory=capabilities)
     name: str = "fake"
     pose: Pose = field(default_factory=lambda: Pose(0.0, 0.0, 0.0))
+    # (3, 3) rotation of the camera in the head's moving frame
+    mount: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
 
     def move(self, pose: Pose) -> None:
         self.pose = Pose(*self.capabilities.nearest_reachable(pose.pan, pose.tilt), pose.zoom)
@@ -72,7 +74,7 @@ class FakeCamera:
     def ball(self, pose: Pose) -> np.ndarray:
         """(2,) px of the ball, NaN where the lens or the head cannot see it."""
         angles = torch.tensor([pose.pan, pose.tilt], dtype=torch.float64)
-        image = project(to_camera(self.ray, *angles)).numpy()
+        image = project(self.mount @ to_camera(self.ray, *angles)).numpy()
         focal = self.focal_length * self.magnification(pose.zoom)
         focal = focal * np.array([1.0, float(self.lens.pixel_aspect[0])])
         ideal = torch.from_numpy(self.principal_point + focal * image)

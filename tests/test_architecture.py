@@ -11,7 +11,7 @@ import torchptz
 
 ROOT = Path(torchptz.__file__).parent
 CORE = (
-    *("batch", "estimation", "files", "geometry", "lens", "patterns"),
+    *("batch", "displacement", "estimation", "files", "geometry", "lens", "patterns", "radial"),
     *("rectangle", "rectification", "zoom_table", "zoom_table_file"),
 )
 EDGE = ("cameras", "cli", "export", "fleet", "report", "scanning", "simulation")

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from tests import synthetic
 from torchptz.cli import _summary_table, main
+from torchptz.estimation import estimate
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.fleet.solve import CameraResult, Summary, ZoomResult, solve
 from torchptz.rectification import rectify
@@ -123,6 +124,22 @@ class TestSmallRun:
         assert run("solve", tmp_path / "run", "--powers", "2,4").exit_code == 0
         assert ZoomTable.load(tmp_path / "run/harp/table.json").lens.powers.tolist() == [2, 4]
 
+    def test_the_way_to_estimate_reaches_the_estimator(self, line_set, tmp_path, monkeypatch):
+        run("collect", line_set, "--out", tmp_path / "run")
+        told = {}
+
+        def watching(patterns, powers, **options):
+            told.update(options, powers=powers)
+            return estimate(patterns, **options)
+
+        monkeypatch.setattr("torchptz.fleet.solve.estimate", watching)
+        assert run("solve", tmp_path / "run").exit_code == 0
+        assert (told["powers"], told["method"], told["robust"]) == ((1.0, 2.0, 3.0), "ml", True)
+        assert run("solve", tmp_path / "run", "--method", "lanz", "--no-robust").exit_code == 0
+        assert (told["method"], told["robust"]) == ("lanz", False)
+        assert run("solve", tmp_path / "run", "--powers", "auto").exit_code == 0
+        assert told["powers"] == "auto"
+
     def test_without_offsets_goes_to_another_table(self, line_set, tmp_path):
         run("collect", line_set, "--out", tmp_path / "run")
         assert run("solve", tmp_path / "run", "--without-offsets").exit_code == 0
@@ -186,6 +203,7 @@ class TestSummaryTable:
             ZoomResult(
                 *(12.0, 11.97, 16384.0, status == "OK", status),
                 **{"rms_px": 0.1234, "gain": 1.0071, "gain_sigma": 0.0062},
+                **{"sigma_px": 0.0523, "systematic_px": 11.406},
                 **{"center": (368.46, 270.61), "lines": 20, "points": 12345},
             )
             for status in ("OK", "CENTER_UNOBSERVABLE", "DISTORTION_UNOBSERVABLE")
@@ -200,18 +218,27 @@ class TestSummaryTable:
         rows = [line.rstrip() for line in text.getvalue().splitlines() if "0.123" in line]
         assert len(rows) == 6
         for row in rows:
-            assert row.split()[-3:] == ["1.007±0.006", "368.5,270.6", "12345"]
+            assert row.split()[-4:] == ["0.123", "0.05+11.4", "1.007±0.006", "368.5,270.6"]
             assert row.split()[1] == "11.97"
         assert rows[2].split()[0] == "entrance"
         assert "dead" in text.getvalue()
+        assert "by noise + by what the head may be off" in text.getvalue()
 
     def test_a_gain_of_unknown_sigma(self):
         zoom = ZoomResult(None, 1.0, None, True, "OK", rms_px=0.1, gain=1.0, gain_sigma=None)
         text = io.StringIO()
         summary = Summary({"a": CameraResult((zoom,), "t", None)})
         Console(file=text, width=80).print(_summary_table(summary, "Lenses"))
-        assert "1.000 " in text.getvalue()
+        assert "1.000" in text.getvalue()
         assert "±" not in text.getvalue()
+
+    def test_without_a_head_there_is_one_sigma(self):
+        zoom = ZoomResult(None, 1.0, None, True, "OK", rms_px=0.1, sigma_px=0.25)
+        text = io.StringIO()
+        summary = Summary({"a": CameraResult((zoom,), "t", None)})
+        Console(file=text, width=80).print(_summary_table(summary, "Lenses"))
+        (row,) = (line for line in text.getvalue().splitlines() if "0.100" in line)
+        assert row.split() == ["a", "1", "ok", "0.100", "0.25"]
 
 
 class TestPartlyFailed:

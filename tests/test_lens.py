@@ -154,25 +154,85 @@ class TestFold:
         torch.testing.assert_close(places[0, 0], points[0, 0], rtol=0, atol=1e-6)
 
     def test_a_lens_without_numbers_is_nowhere(self):
-        lens = make([math.nan], (2,))
-        assert bool(lens.undistort(double([[[1.0, 2.0]]])).isnan().all())
-        assert bool(lens.distort(double([[[1.0, 2.0]]])).isnan().all())
+        for nothing in (math.nan, math.inf):
+            lens = make([nothing], (2,))
+            points = double([[[1.0, 2.0], [310.0, 250.0]]])  # not at its centre either
+            assert bool(lens.valid_radius.isnan())
+            assert bool(lens.undistort(points).isnan().all())
+            assert bool(lens.distort(points).isnan().all())
 
 
 class TestInverse:
-    @given(
-        coefficients=st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3),
-        powers=st.sampled_from([(1, 2, 3), (2, 4, 6), (0.5, 1, 2.5)]),
-        aspect=st.floats(0.8, 1.25),
-        seed=st.integers(0, 999),
+    kinds = (
+        st.sampled_from([(1, 2, 3), (2, 4, 6), (1, 3, 5), (0.5, 1, 2.5)]),
+        st.lists(st.floats(-0.5, 0.5) | st.floats(-3, 3), min_size=3, max_size=3),
+        st.tuples(st.floats(0, 640), st.floats(0, 480)),
+        st.floats(0.8, 1.25),
+        st.integers(0, 999),
     )
-    @settings(max_examples=60, deadline=None)
-    def test_distort_undoes_undistort_up_to_the_fold(self, coefficients, powers, aspect, seed):
-        lens = make(coefficients, powers, pixel_aspect=aspect)
-        points = torch.from_numpy(np.random.default_rng(seed).uniform([0, 0], SIZE, (1, 50, 2)))
-        inside = lens.radius(points) * lens.scale <= 0.99 * lens.valid_radius
-        back = lens.distort(lens.undistort(points))
-        torch.testing.assert_close(back[inside], points[inside], rtol=0, atol=1e-7)
+
+    @staticmethod
+    def around(lens, radii, seed):
+        """(1, N, 2) points at distances (N,) from the centre, one of them on each axis."""
+        angles = np.random.default_rng(seed).uniform(0, 2 * math.pi, len(radii))
+        angles[:4] = [0, math.pi / 2, math.pi, -math.pi / 2]
+        x = radii * torch.from_numpy(np.cos(angles)) / lens.pixel_aspect
+        y = radii * torch.from_numpy(np.sin(angles))
+        return lens.center + torch.stack([x, y], -1)[None]
+
+    @given(*kinds)
+    @settings(max_examples=80, deadline=None)
+    def test_distort_undoes_undistort_up_to_the_fold(
+        self, powers, coefficients, center, aspect, seed
+    ):
+        lens = make(coefficients, powers, center, pixel_aspect=aspect)
+        edge = float(lens.valid_radius.clamp(max=800))
+        even, closer = np.linspace(0, 1, 40), 1 - np.logspace(-1, -10, 20)  # to the fold
+        points = self.around(lens, edge * torch.from_numpy(np.concatenate([even, closer])), seed)
+        ideal = lens.undistort(points)
+        there = lens.is_valid(points)  # but for what rounding moved over the fold
+        back, converged = lens.distort_with_mask(ideal)
+        assert bool(converged[there].all())
+        assert int((~there).sum()) <= 1
+        off = torch.linalg.vector_norm(back - points, dim=-1)
+        # Where r L(r) is flat, a point is as sharp as the last digits of its undistorted place.
+        r = lens.radius(points)
+        slope = 1 + sum(c * (p + 1) * r**p for c, p in zip(coefficients, powers, strict=True))
+        size = 1 + sum(abs(c) * (p + 1) * r**p for c, p in zip(coefficients, powers, strict=True))
+        assert bool((off <= 1e-9 + 3e-12 * size / slope.clamp_min(1e-30))[there].all())
+        assert bool((off[there & (slope > 0.1 * size)] <= 1e-9).all())
+
+    @given(*kinds)
+    @settings(max_examples=80, deadline=None)
+    def test_undistort_undoes_distort_or_there_is_no_answer(
+        self, powers, coefficients, center, aspect, seed
+    ):
+        lens = make(coefficients, powers, center, pixel_aspect=aspect)
+        reach = min(float(lens.valid_radius), 1e4)
+        reach *= correction(reach / 320, coefficients, powers)
+        radii = torch.linspace(0, 1500, 100, dtype=torch.float64)
+        if reach < 1500:  # on both sides of the last one that can be reached
+            close = torch.logspace(-1, -10, 20, dtype=torch.float64)
+            radii = torch.cat([radii, reach * (1 - close), reach * (1 + close)])
+        points = self.around(lens, radii, seed)
+        places, converged = lens.distort_with_mask(points)
+        expected = lens.radius(points) * 320
+        assert bool(converged[expected < reach - 1e-9].all())
+        assert not bool(converged[expected > reach + 1e-9].any())
+        assert torch.equal(converged, places.isfinite().all(-1))
+        off = torch.linalg.vector_norm(lens.undistort(places) - points, dim=-1)
+        assert bool((off[converged] <= 1e-9).all())  # and NaN would not be
+
+    def test_single_precision_in_and_out_is_double_precision_inside(self):
+        lens = make([-0.12, 0.03, -0.02], pixel_aspect=0.9)
+        points = torch.from_numpy(np.random.default_rng(0).uniform([0, 0], SIZE, (1, 99, 2)))
+        points = torch.cat([points, lens.center[None], lens.center[None] + double([0, 9])], 1)
+        for method in (lens.distort, lens.undistort):
+            single = method(points.float())
+            assert single.dtype == torch.float32
+            torch.testing.assert_close(
+                single, method(points.float().double()).float(), rtol=0, atol=0
+            )
 
     def test_where_newton_alone_leaps_to_and_fro(self):
         lens = make([0.0, 0.48, -0.242], (2, 4, 6))
@@ -202,21 +262,33 @@ class TestInverse:
 
 
 class TestGradients:
-    points = double([[[310.0, 250.0], [310.0, 251.0], [20.0, 30.0], [600.0, 470.0]]])
+    # At the centre, on both axes through it, and anywhere.
+    points = double([[[310.0, 250.0], [310.0, 251.0], [450, 250], [20.0, 30.0], [600.0, 470.0]]])
 
     @staticmethod
-    def of(method, powers=(1, 2, 3)):
+    def of(method, powers=(1, 2, 3), aspect=1.0):
         def function(points, center, coefficients):
-            return getattr(RadialLens(center, coefficients, powers, None, SIZE), method)(points)
+            lens = RadialLens(center, coefficients, powers, None, SIZE, aspect)
+            return getattr(lens, method)(points)
 
         return function
 
+    def inputs(self):
+        values = self.points[:, 1:], double([[310.0, 250.0]]), double([[-0.08, 0.03, -0.01]])
+        return [value.clone().requires_grad_() for value in values]
+
+    @pytest.mark.parametrize("method", ["undistort", "distort"])
+    @pytest.mark.parametrize("powers", [(1, 2, 3), (2, 3.5, 6), (0.5, 1, 5)])
+    @pytest.mark.parametrize("aspect", [1.0, 0.9])
+    def test_gradcheck_away_from_the_centre(self, method, powers, aspect):
+        function = self.of(method, powers, aspect)
+        assert torch.autograd.gradcheck(function, self.inputs(), eps=1e-5, atol=1e-5)
+
     @pytest.mark.parametrize("method", ["undistort", "distort"])
     @pytest.mark.parametrize("powers", [(1, 2, 3), (2, 3.5, 6)])
-    def test_gradcheck_away_from_the_centre(self, method, powers):
-        inputs = self.points[:, 1:], double([[310.0, 250.0]]), double([[-0.08, 0.03, -0.01]])
-        inputs = [value.clone().requires_grad_() for value in inputs]
-        assert torch.autograd.gradcheck(self.of(method, powers), inputs, eps=1e-5, atol=1e-5)
+    def test_second_derivatives_away_from_the_centre(self, method, powers):
+        function = self.of(method, powers, 0.9)
+        assert torch.autograd.gradgradcheck(function, self.inputs(), eps=1e-4, atol=1e-4)
 
     @pytest.mark.parametrize("method", ["undistort", "distort"])
     def test_gradcheck_at_the_centre(self, method):

@@ -1,6 +1,7 @@
 """Line patterns: padding, round trips, what is refused and how it is named."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ def ragged(seed, shape):
     points = [[rng.uniform(0, 479, (n, 2)) for n in lines] for lines in shape]
     offsets = [[rng.normal(size=(n, 2)) for n in lines] for lines in shape]
     sigma = [[rng.uniform(0.1, 1, n) for n in lines] for lines in shape]
-    return points, offsets, sigma
+    systematic = [[rng.normal(size=(n, 2, 4)) for n in lines] for lines in shape]
+    return points, offsets, sigma, systematic
 
 
 shapes = st.lists(st.lists(st.integers(3, 9), min_size=1, max_size=4), min_size=1, max_size=4)
@@ -28,22 +30,25 @@ LISTED = ragged(0, [[3, 5], [4]])
 
 class TestPadding:
     def test_points_are_where_the_mask_says(self):
-        points, offsets, sigma = LISTED
-        patterns = LinePatterns.from_lists(points, SIZE, offsets, sigma)
+        points, offsets, sigma, systematic = LISTED
+        patterns = LinePatterns.from_lists(points, SIZE, offsets, sigma, systematic)
         assert patterns.points.shape == (2, 2, 5, 2)
+        assert patterns.systematic.shape == (2, 2, 5, 2, 4)
         assert patterns.points.dtype == patterns.sigma.dtype == torch.float64
         assert patterns.mask.sum(-1).tolist() == [[3, 5], [4, 0]]
         assert patterns.line_mask.tolist() == [[True, True], [True, False]]
         np.testing.assert_array_equal(patterns.points[0, 1], points[0][1])
         np.testing.assert_array_equal(patterns.offsets[1, 0, :4], offsets[1][0])
         np.testing.assert_array_equal(patterns.sigma[0, 0, :3], sigma[0][0])
+        np.testing.assert_array_equal(patterns.systematic[1, 0, :4], systematic[1][0])
 
     def test_padding_is_harmless(self):
-        patterns = LinePatterns.from_lists(LISTED[0], SIZE, LISTED[1], LISTED[2])
+        patterns = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
         hidden = ~patterns.mask
         assert bool((patterns.points[hidden] == 0).all())
         assert bool((patterns.offsets[hidden] == 0).all())
         assert bool((patterns.sigma[hidden] == 1).all())
+        assert bool((patterns.systematic[hidden] == 0).all())
 
     def test_one_size_for_all_or_one_each(self):
         points = LISTED[0]
@@ -56,6 +61,7 @@ class TestPadding:
         patterns = LinePatterns.from_lists(LISTED[0], SIZE)
         assert patterns.offsets is None
         assert patterns.sigma is None
+        assert patterns.systematic is None
 
     def test_the_picture_reaches_half_a_pixel_beyond_its_outer_centres(self):
         corner = np.array([[-0.5, -0.5], [639.5, 479.5], [0, 0]])
@@ -72,8 +78,8 @@ class TestRoundTrips:
     @given(shape=shapes, seed=st.integers(0, 99))
     @settings(max_examples=40, deadline=None)
     def test_lists(self, shape, seed):
-        points, offsets, sigma = ragged(seed, shape)
-        back = LinePatterns.from_lists(points, SIZE, offsets, sigma).to_lists()
+        points, *beside = ragged(seed, shape)
+        back = LinePatterns.from_lists(points, SIZE, *beside).to_lists()
         assert [[len(line) for line in lines] for lines in back] == shape
         for lines, expected in zip(back, points, strict=True):
             for line, points_of_line in zip(lines, expected, strict=True):
@@ -83,18 +89,19 @@ class TestRoundTrips:
     @settings(max_examples=25, deadline=None)
     def test_files(self, tmp_path_factory, shape, beside, seed):
         path = tmp_path_factory.getbasetemp() / "patterns"  # and no ending is put behind it
-        points, offsets, sigma = ragged(seed, shape)
-        patterns = LinePatterns.from_lists(points, SIZE, *((offsets, sigma) if beside else ()))
+        points, *listed = ragged(seed, shape)
+        patterns = LinePatterns.from_lists(points, SIZE, *(listed if beside else ()))
         patterns.save(path)
         self.assert_same(LinePatterns.load(path), patterns)
 
     @given(shape=shapes, seed=st.integers(0, 99), start=st.integers(-5, 5), stop=st.integers(-5, 5))
     @settings(max_examples=40, deadline=None)
     def test_slices(self, shape, seed, start, stop):
-        points, offsets, sigma = ragged(seed, shape)
-        patterns = LinePatterns.from_lists(points, SIZE, offsets, sigma)
+        points, *beside = ragged(seed, shape)
+        patterns = LinePatterns.from_lists(points, SIZE, *beside)
         cut = patterns[start:stop]
         assert len(cut) == len(points[start:stop])
+        assert torch.equal(cut.systematic, patterns.systematic[start:stop])
         for lines, expected in zip(cut.to_lists(), points[start:stop], strict=True):
             assert [line.tolist() for line in lines] == [line.tolist() for line in expected]
 
@@ -114,10 +121,10 @@ class TestRoundTrips:
         assert list(tmp_path.iterdir()) == [path]
 
     def test_without_offsets_all_else_stays(self):
-        whole = LinePatterns.from_lists(LISTED[0], SIZE, LISTED[1], LISTED[2])
+        whole = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
         bare = whole.without_offsets()
         assert bare.offsets is None
-        for name in ("points", "mask", "image_size", "sigma"):
+        for name in ("points", "mask", "image_size", "sigma", "systematic"):
             assert torch.equal(getattr(bare, name), getattr(whole, name))
         assert whole.offsets is not None
 
@@ -136,17 +143,38 @@ class TestRoundTrips:
         self.assert_same(stacked, LinePatterns.from_lists(together[0], sizes, *together[1:]))
 
     def test_stack_fills_in_what_one_batch_lacks(self):
-        points, offsets, sigma = LISTED
+        points, *beside = LISTED
         bare = LinePatterns.from_lists(points, SIZE)
-        stacked = LinePatterns.stack([bare, LinePatterns.from_lists(points, SIZE, offsets, sigma)])
+        stacked = LinePatterns.stack([bare, LinePatterns.from_lists(points, SIZE, *beside)])
         assert bool((stacked.offsets[:2] == 0).all())
         assert bool((stacked.sigma[:2] == 1).all())
-        np.testing.assert_array_equal(stacked.offsets[2, 1], offsets[0][1])
+        assert bool((stacked.systematic[:2] == 0).all())
+        np.testing.assert_array_equal(stacked.offsets[2, 1], beside[0][0][1])
         assert LinePatterns.stack([bare, bare]).sigma is None
+
+    def test_stack_fills_up_the_systematic_errors_of_the_batch_with_fewer(self):
+        points, *_, systematic = LISTED
+        fewer = [[line[..., :1] for line in lines] for lines in systematic]
+        stacked = LinePatterns.stack(
+            [LinePatterns.from_lists(points, SIZE, systematic=s) for s in (fewer, systematic)]
+        )
+        np.testing.assert_array_equal(stacked.systematic[0, 1, ..., 0], fewer[0][1][..., 0])
+        assert bool((stacked.systematic[:2, ..., 1:] == 0).all())
+        np.testing.assert_array_equal(stacked.systematic[2, 1], systematic[0][1])
+
+    def test_files_from_before_systematic_errors_are_read(self, tmp_path):
+        path = tmp_path / "old.npz"
+        patterns = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
+        patterns.save(path)
+        with np.load(path) as stored:
+            arrays = {name: value for name, value in stored.items() if name != "systematic"}
+        np.savez(path, **arrays)
+        assert LinePatterns.load(path).systematic is None
+        self.assert_same(LinePatterns.load(path), replace(patterns, systematic=None))
 
     @staticmethod
     def assert_same(one, other):
-        for name in ("points", "mask", "image_size", "offsets", "sigma"):
+        for name in ("points", "mask", "image_size", "offsets", "sigma", "systematic"):
             left, right = getattr(one, name), getattr(other, name)
             assert (left is None) == (right is None), name
             if left is not None:
@@ -210,6 +238,22 @@ class TestRefusals:
         with pytest.raises(ValueError, match="offsets, pattern 0, line 0: a value is NaN or inf"):
             LinePatterns.from_lists([[self.good]], SIZE, offsets=[[np.full((3, 2), math.inf)]])
 
+    @pytest.mark.parametrize(
+        ("second", "words"),
+        [
+            (np.zeros((3, 2, 1)), r"line 1: shape must be \(3, 2, 2\), not \(3, 2, 1\)"),
+            (np.zeros((3, 2)), r"line 1: shape must be \(3, 2, 2\), not \(3, 2\)"),
+            (np.full((3, 2, 2), math.inf), "line 1: a value is NaN or infinite"),
+        ],
+    )
+    def test_systematic(self, second, words):
+        with pytest.raises(ValueError, match=f"systematic, pattern 0, {words}"):
+            LinePatterns.from_lists(
+                [[self.good, self.good]], SIZE, systematic=[[np.zeros((3, 2, 2)), second]]
+            )
+        with pytest.raises(ValueError, match="systematic, pattern 0, line 0: shape must be"):
+            LinePatterns.from_lists([[self.good]], SIZE, systematic=[[1.0]])
+
     def test_tensors_that_do_not_fit_together(self):
         points, size = torch.zeros(2, 3, 4, 2), torch.ones(2, 2)
         with pytest.raises(ValueError, match=r"points must have shape \(B, L, P, 2\)"):
@@ -220,6 +264,9 @@ class TestRefusals:
             LinePatterns(points, torch.ones(2, 3, 4), size)
         with pytest.raises(ValueError, match=r"sigma must have shape \(2, 3, 4\)"):
             LinePatterns(points, torch.ones(2, 3, 4).bool(), size, sigma=torch.ones(2, 3))
+        wrong = torch.ones(2, 3, 3, 2, 5)
+        with pytest.raises(ValueError, match=r"systematic must have shape \(2, 3, 4, 2, 5\)"):
+            LinePatterns(points, torch.ones(2, 3, 4).bool(), size, systematic=wrong)
 
 
 class TestBadFiles:

@@ -42,6 +42,7 @@ def full_table(**options):
         gain=[1.01, 1.02, math.nan],
         gain_sigma=[0.01, 0.02, math.nan],
         covariance=torch.eye(4).double().repeat(3, 1, 1) * 0.25,
+        systematic_covariance=torch.ones(3, 4, 4).double() * 0.5,
         focal_length_px=np.array([500.0, 1000.0, 4000.0]),
         focal_length_sigma_px=[1.0, 2.0, 8.0],
         points=[100, 200, 300],
@@ -230,9 +231,11 @@ class TestFile:
         assert loaded.principal_point_covariance.tolist() == [[1.0, 0.1], [0.1, 2.0]]
         for one, other in zip(loaded.knots, table.knots, strict=True):
             assert_same_lens(one.lens, other.lens, rtol=0, atol=0)
-            torch.testing.assert_close(one.covariance, other.covariance, rtol=0, atol=0)
+            for name in ("covariance", "systematic_covariance"):
+                kept, given = getattr(one, name), getattr(other, name)
+                torch.testing.assert_close(kept, given, rtol=0, atol=0)
             for field in fields(Knot):
-                if field.name not in ("lens", "covariance"):
+                if field.name not in ("lens", "covariance", "systematic_covariance"):
                     name = field.name
                     assert getattr(one, name) == getattr(other, name), name
         assert loaded.knots[2].gain is None  # NaN is no JSON
@@ -249,6 +252,17 @@ class TestFile:
         stored = json.loads(path.read_text(), parse_constant=pytest.fail)
         assert stored["knots"][0]["covariance"][:2] == [[None, 0, 0, 0], [0, None, 0, 0]]
         assert torch.equal(ZoomTable.load(path).knots[0].covariance, covariance)
+
+    def test_a_table_from_before_systematic_covariances_is_read(self, tmp_path):
+        path = tmp_path / "table.json"
+        full_table().save(path)
+        stored = json.loads(path.read_text())
+        for knot in stored["knots"]:
+            del knot["systematic_covariance"]
+        path.write_text(json.dumps(stored))
+        for old, knot in zip(ZoomTable.load(path).knots, full_table().knots, strict=True):
+            assert old.systematic_covariance is None
+            torch.testing.assert_close(old.covariance, knot.covariance, rtol=0, atol=0)
 
     def test_an_interrupted_write_leaves_the_old_table(self, tmp_path, monkeypatch):
         path = tmp_path / "table.json"
@@ -337,6 +351,7 @@ class TestRefusedFiles:
             ("covariance", [[1]], "knots[1].covariance must be a list of 4x4 finite numbers"),
             ("covariance", [None] * 4, "knots[1].covariance must be a list of 4x4 finite"),
             ("covariance", [[math.nan] * 4] * 4, "knots[1].covariance must be a list of 4x4"),
+            ("systematic_covariance", [[1]], "knots[1].systematic_covariance must be a list of"),
             ("nominal_zoom", -1, "knots[1]: zoom 2: nominal_zoom must be a positive magnif"),
             ("rms_px", "small", "knots[1].rms_px must be a finite number, not 'small'"),
             ("usable", "yes", "knots[1].usable must be true or false, not 'yes'"),

@@ -49,9 +49,14 @@ class Batched:
         changed = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name not in self._shared and value is not None:
+            if field.name in self._shared or value is None:
+                continue
+            new = getattr(items, field.name)
+            if isinstance(value, Batched):
+                changed[field.name] = value.with_items(index, new)
+            else:
                 changed[field.name] = value.clone()
-                changed[field.name][index] = getattr(items, field.name)
+                changed[field.name][index] = new
         return replace(self, **changed)
 
     def to(self, device: torch.device | str) -> Self:
@@ -60,5 +65,21 @@ class Batched:
             field.name: getattr(self, field.name).to(device)
             for field in fields(self)
             if isinstance(getattr(self, field.name), Tensor | Batched)
+        }
+        return replace(self, **changed)
+
+    def where(self, chosen: Tensor, other: Self) -> Self:
+        """This batch's items where ``chosen`` (B,) bool, another batch's for the rest."""
+
+        def pick(value: Tensor | Batched, alternative: Tensor | Batched) -> Tensor | Batched:
+            if isinstance(value, Batched):
+                return value.where(chosen, alternative)
+            mask = chosen.reshape(-1, *([1] * (value.ndim - 1)))
+            return torch.where(mask, value, alternative)
+
+        changed = {
+            field.name: pick(getattr(self, field.name), getattr(other, field.name))
+            for field in fields(self)
+            if field.name not in self._shared and getattr(self, field.name) is not None
         }
         return replace(self, **changed)

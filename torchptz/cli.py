@@ -33,22 +33,48 @@ logger = logging.getLogger(__name__)
 
 
 class _Powers(click.ParamType):
-    """A list such as 1,2,3."""
+    """A list such as 1,2,3, or auto."""
 
     name = "numbers"
 
     def convert(self, value, param, ctx):
-        if isinstance(value, tuple):
+        if isinstance(value, tuple) or value == "auto":
             return value
         try:
             return tuple(float(part) for part in value.split(","))
         except ValueError:
-            self.fail(f"{value!r} is not a list of numbers such as 1,2,3", param, ctx)
+            self.fail(f"{value!r} is neither auto nor a list such as 1,2,3", param, ctx)
 
 
-_powers = click.option(
-    "--powers", type=_Powers(), default="1,2,3", show_default=True, help="Powers of r in the lens."
+_ESTIMATION = (
+    click.option(
+        "--powers",
+        type=_Powers(),
+        default="1,2,3",
+        show_default=True,
+        help="Powers of r in the lens; auto: whichever predict best.",
+    ),
+    click.option(
+        "--method",
+        type=click.Choice(["ml", "lanz"]),
+        default="ml",
+        show_default=True,
+        help="Maximum likelihood, or the paper's iteration.",
+    ),
+    click.option(
+        "--robust/--no-robust",
+        default=True,
+        show_default=True,
+        help="Set outlying points and lines aside; of method ml.",
+    ),
 )
+
+
+def _estimation(command: Callable) -> Callable:
+    """Adds the options of how lenses are estimated."""
+    for option in reversed(_ESTIMATION):
+        command = option(command)
+    return command
 
 
 class _Commands(click.Group):
@@ -172,13 +198,13 @@ def _collect_fleet(config: Path, out: Path) -> None:
 
 @main.command()
 @click.argument("run", type=_OUT)
-@_powers
+@_estimation
 @click.option("--without-offsets", is_flag=True, help="Ignore the points' known offsets.")
-def solve(run: Path, powers: tuple[float, ...], without_offsets: bool) -> None:
+def solve(run: Path, without_offsets: bool, **estimation: object) -> None:
     """Estimate the lenses of all cameras and zooms collected in RUN; write a table for each."""
     from torchptz.fleet.solve import solve
 
-    summary = solve(run, powers, offsets=not without_offsets)
+    summary = solve(run, offsets=not without_offsets, **estimation)
     _print_summary(summary, run)
     _exit(summary.all_ok, summary.none_ok)
 
@@ -186,13 +212,13 @@ def solve(run: Path, powers: tuple[float, ...], without_offsets: bool) -> None:
 @main.command()
 @click.argument("config", type=_FILE)
 @click.option("--out", "-o", type=_OUT, required=True, help="Folder of the run.")
-@_powers
-def calibrate(config: Path, out: Path, powers: tuple[float, ...]) -> None:
+@_estimation
+def calibrate(config: Path, out: Path, **estimation: object) -> None:
     """Collect and solve the fleet of CONFIG: one table of lenses a camera."""
     from torchptz.fleet.calibrate import calibrate
 
     with _fleet_progress() as progress:
-        summary = calibrate(config, out, powers, progress)
+        summary = calibrate(config, out, progress=progress, **estimation)
     _print_summary(summary, out)
     _exit(summary.all_ok, summary.none_ok)
 
@@ -290,9 +316,11 @@ def _print_summary(summary, run: Path) -> None:
 def _summary_table(summary, title: str) -> Table:
     """A row a zoom, of one line on 80 columns."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+    table.caption = "px; sigma: of the worst point, by noise + by what the head may be off"
+    table.caption_justify = "left"
     # Where that is too narrow, a long name is cut and no number.
     table.add_column("camera", overflow="ellipsis")
-    for heading in ("zoom", "status", "rms px", "gain", "centre", "points"):
+    for heading in ("zoom", "status", "rms", "sigma", "gain", "centre"):
         table.add_column(heading, justify="left" if heading == "status" else "right", no_wrap=True)
     for name, camera in summary.cameras.items():
         for zoom in camera.zooms:
@@ -302,13 +330,19 @@ def _summary_table(summary, title: str) -> Table:
                 f"{zoom.magnification:.4g}",
                 _short(zoom.status),
                 "" if zoom.rms_px is None else f"{zoom.rms_px:.3f}",
+                _sigmas(zoom),
                 "" if zoom.gain is None else f"{zoom.gain:.3f}{sigma}",
                 "" if zoom.center is None else f"{zoom.center[0]:.1f},{zoom.center[1]:.1f}",
-                str(zoom.points),
             )
         if not camera.zooms:
-            table.add_row(name, "", _short(None), "", "", "", "0")
+            table.add_row(name, "", _short(None))
     return table
+
+
+def _sigmas(zoom) -> str:
+    """px, statistical, and systematic where that is known: 0.12+1.40."""
+    known = (zoom.sigma_px, zoom.systematic_px)
+    return "+".join(f"{s:.2f}" if s < 10 else f"{s:.1f}" for s in known if s is not None)
 
 
 def _short(status: str | None) -> str:

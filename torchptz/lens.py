@@ -14,16 +14,12 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.displacement import Part, displacement_sigma
 from torchptz.files import write_whole
+from torchptz.radial import RadialFunction
 
 SCHEMA = "torchptz.lens"
 SCHEMA_VERSION = 1
-
-# A fold farther out than this many units of r is outside every picture and counts as none.
-_FARTHEST = 1e4
-_BISECTIONS = 80
-_NEWTON_STEPS = 100
-_SETTLED = 1e-15  # change of r, and what is left of the equation: rounding level
 
 
 def checked_powers(powers: Sequence[float] | Tensor) -> Tensor:
@@ -115,11 +111,11 @@ class RadialLens(Batched):
             coefficients.
         """
         offset = self._from_center(points)
-        radius = self.radius(points)
-        undistorted = self._per_item(self.center, points) + self._correction(radius) * offset
-        inside = radius <= self._per_item(self.valid_radius / self.scale, points)
+        correction = self._radial.value(self.radius(points)).unsqueeze(-1)
+        undistorted = self._per_item(self.center, points) + correction * offset
         nowhere = torch.full_like(undistorted, math.nan)
-        return _as_given(torch.where(inside.unsqueeze(-1), undistorted, nowhere), points)
+        inside = self.is_valid(points).unsqueeze(-1)
+        return _as_given(torch.where(inside, undistorted, nowhere), points)
 
     def distort(self, points: Tensor) -> Tensor:
         """Undistorted to picture points, the inverse of `undistort`.
@@ -129,7 +125,9 @@ class RadialLens(Batched):
 
         Returns:
             (B, ..., 2) px, NaN where no point inside `valid_radius` is undistorted to there.
-            First derivatives follow the implicit function theorem.
+            Its undistorted place is that of the point to 1e-9 px and better, everywhere; so the
+            point itself is sharp but next to the fold, where ``r L(r)`` is flat. First and second
+            derivatives follow the implicit function theorem.
         """
         return self.distort_with_mask(points)[0]
 
@@ -137,37 +135,60 @@ class RadialLens(Batched):
         """`distort`, and a mask (B, ...) of the points for which it converged."""
         offset = self._from_center(points)
         scale = self._per_item(self.scale, points)
-        with torch.no_grad():
-            radius, converged = self._solve_radius(self._norm(offset, points) / scale)
-            slope = self._slope(radius).clamp_min(torch.finfo(radius.dtype).eps)
+        radius, converged = self._radial.inverse(self._norm(offset, points) / scale)
         # What has no source must not reach the arithmetic: behind a mask, the gradient of a value
         # that is not finite is NaN.
         radius = torch.where(converged, radius, 0.0)
         offset = torch.where(converged.unsqueeze(-1), offset, 0.0)
-        # Zero in value, this carries the derivative of the radius: d(radius)/d(target) =
-        # 1 / (r L)', and the one with respect to the coefficients.
+        # Zero in value, a step of Newton's carries the derivatives of the radius: d(radius) /
+        # d(target) = 1 / (r L)', and those with respect to the coefficients; another step carries
+        # the second ones.
         target = self._norm(offset, points) / scale
-        error = target - radius * self._correction(radius).squeeze(-1)
-        radius = radius + (error - error.detach()) / slope
-        distorted = self._per_item(self.center, points) + offset / self._correction(radius)
+        twice = target.requires_grad or self.coefficients.requires_grad
+        for _ in range(2 if twice else 1):
+            slope = self._radial.slope(radius).clamp_min(torch.finfo(radius.dtype).eps)
+            error = target - radius * self._radial.value(radius)
+            radius = radius + (error - error.detach()) / slope
+        correction = self._radial.value(radius).unsqueeze(-1)
+        distorted = self._per_item(self.center, points) + offset / correction
         nowhere = torch.full_like(distorted, math.nan)
         distorted = torch.where(converged.unsqueeze(-1), distorted, nowhere)
         return _as_given(distorted, points), converged
 
     @cached_property
     def valid_radius(self) -> Tensor:
-        """(B,) px in square units, where ``r L(r)`` stops growing; inf where it never folds."""
-        with torch.no_grad():
-            terms = torch.cat(
-                [torch.ones_like(self.scale)[:, None], self.coefficients * (self.powers + 1)], 1
-            )
-            exponents = torch.cat([self.powers.new_zeros(1), self.powers])
-            first = _positive_roots(terms, exponents)[:, 0]
-        return first * self.scale
+        """(B,) px in square units, where ``r L(r)`` stops growing; inf where it never folds.
+
+        NaN for coefficients that are not finite: such a lens holds nowhere.
+        """
+        return self._radial.fold * self.scale
 
     def radius(self, points: Tensor) -> Tensor:
         """(B, ...) distance of picture points (B, ..., 2) from the centre, in units of r."""
         return self._norm(self._from_center(points), points) / self._per_item(self.scale, points)
+
+    def is_valid(self, points: Tensor) -> Tensor:
+        """(B, ...) bool, whether picture points (B, ..., 2) lie within `valid_radius`."""
+        return self.radius(points) <= self._per_item(self._radial.fold, points)
+
+    def displacement_sigma(self, points: Tensor, covariance: Tensor, part: Part = "all") -> Tensor:
+        """Root-mean-square length of the error that `undistort` makes.
+
+        Args:
+            points: (B, ..., 2) px in the picture; B may be 1.
+            covariance: (B, 2+K, 2+K) of (cx px, cy px, coefficients), such as a fit's, statistical
+                or systematic; inf on the diagonal of what is not known at all.
+            part: "all"; or "lines", what the best small homography over the picture leaves, the
+                part that straight lines fix; or "homography", the one that they cannot.
+
+        Returns:
+            (B, ...) px, NaN beyond `valid_radius`, inf where something unknown matters. Averaged
+            over the picture, the squares of both parts add up to that of all.
+
+        Raises:
+            ValueError: shapes that do not fit, another part.
+        """
+        return displacement_sigma(self, points, covariance, part)
 
     def farthest_corner(self) -> Tensor:
         """(B,) px in square units, distance from the centre to the farthest image corner."""
@@ -251,96 +272,11 @@ class RadialLens(Batched):
         at_center = squared == 0
         return torch.where(at_center, 0.0, torch.where(at_center, 1.0, squared).sqrt())
 
-    def _correction(self, radius: Tensor) -> Tensor:
-        """``L(r)`` of (B, ...) radii, with a last axis of one to multiply points."""
-        return self._series(radius, self.coefficients)
-
-    def _slope(self, radius: Tensor) -> Tensor:
-        """``d(r L(r)) / dr`` of (B, ...) radii."""
-        return self._series(radius, self.coefficients * (self.powers + 1)).squeeze(-1)
-
     @cached_property
-    def _gaps(self) -> list[float]:
-        """From each power to the next, from 0 on."""
-        return self.powers.diff(prepend=self.powers.new_zeros(1)).tolist()
-
-    def _series(self, radius: Tensor, coefficients: Tensor) -> Tensor:
-        """``1 + sum_k coefficients[k] r^powers[k]`` by Horner's rule, with a last axis of one."""
-        away = radius > 0
-        base = torch.where(away, radius, 1.0)  # some powers have no derivative at 0
-        inner = [1] * (radius.ndim - 1)
-        total = torch.zeros_like(radius)
-        for gap, column in zip(
-            reversed(self._gaps), reversed(coefficients.unbind(-1)), strict=True
-        ):
-            total = base**gap * (column.reshape(len(self), *inner) + total)
-        return 1 + torch.where(away, total, 0.0).unsqueeze(-1)
-
-    def _solve_radius(self, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Newton on ``r L(r) = target``, kept in a bracket by bisection; (B, ...) each."""
-        farthest = (self.valid_radius / self.scale).clamp(max=_FARTHEST)
-        farthest = farthest.reshape(-1, *([1] * (target.ndim - 1))).expand_as(target)
-        reachable = target <= farthest * self._correction(farthest).squeeze(-1)
-        low, high = torch.zeros_like(target), farthest.clone()
-        radius, step = torch.minimum(target, farthest), high - low
-        settled = ~reachable
-        for _ in range(_NEWTON_STEPS):
-            excess = radius * self._correction(radius).squeeze(-1) - target
-            low = torch.where(excess <= 0, radius, low)
-            high = torch.where(excess >= 0, radius, high)
-            newton = radius - excess / self._slope(radius)
-            # Where Newton does not halve its step it may leap to and fro between two ends.
-            good = (newton >= low) & (newton <= high) & ((newton - radius).abs() <= step / 2)
-            following = torch.where(good, newton, (low + high) / 2)
-            step = (following - radius).abs()
-            # A settled point is left alone, so that it does not depend on its neighbours.
-            radius = torch.where(settled, radius, following)
-            settled |= (step <= _SETTLED * (1 + radius)) | (excess.abs() <= _SETTLED * (1 + target))
-            if bool(settled.all()):
-                break
-        # Newton's last step is at rounding level unless it is still hunting near the fold, where
-        # bisection has closed the bracket.
-        error = (radius * self._correction(radius).squeeze(-1) - target).abs()
-        return radius, reachable & (error <= 1e-12 * (1 + target))
+    def _radial(self) -> RadialFunction:
+        return RadialFunction(self.coefficients, self.powers)
 
 
 def _as_given(result: Tensor, points: Tensor) -> Tensor:
     """In the dtype of the points, unless that cannot hold fractions."""
     return result.to(points.dtype) if points.is_floating_point() else result
-
-
-def _positive_roots(terms: Tensor, exponents: Tensor) -> Tensor:
-    """Positive roots of ``sum_k terms[k] r^exponents[k]``, for any real increasing exponents.
-
-    Rolle: between neighbouring roots of the derivative, which has a term less once its lowest
-    power is divided out, the sum is monotonic, so that bisection finds each of its roots.
-
-    Args:
-        terms: (B, M) coefficients.
-        exponents: (M,) increasing, the first one 0.
-
-    Returns:
-        (B, max(M - 1, 1)), ascending, inf where there are fewer.
-    """
-    batch, count = terms.shape
-    if count == 1:
-        return terms.new_full((batch, 1), math.inf)
-    turning = _positive_roots(terms[:, 1:] * exponents[1:], exponents[1:] - exponents[1])
-    knots = torch.cat(
-        [terms.new_zeros(batch, 1), turning, terms.new_full((batch, 1), math.inf)], 1
-    ).clamp(max=_FARTHEST)
-
-    def value(radius: Tensor) -> Tensor:
-        powers = torch.where(
-            radius.unsqueeze(-1) > 0, radius.unsqueeze(-1) ** exponents, (exponents == 0).double()
-        )
-        return (powers * terms[:, None]).sum(-1)
-
-    low, high = knots[:, :-1], knots[:, 1:]
-    sign = torch.sign(value(low))
-    crosses = sign * torch.sign(value(high)) < 0
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        same = torch.sign(value(middle)) == sign
-        low, high = torch.where(same, middle, low), torch.where(same, high, middle)
-    return torch.where(crosses, (low + high) / 2, math.inf).sort(1).values

@@ -15,6 +15,7 @@ from torchptz.files import read_arrays, whole_file
 
 SCHEMA_VERSION = 1
 _FEWEST_POINTS = 3
+_BESIDE = {"offsets": 0.0, "sigma": 1.0, "systematic": 0.0}  # and what they are where no point is
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,9 @@ class LinePatterns(Batched):
             it, and its reading says where that is.
         sigma: (B, L, P) or None: standard deviation of a point per coordinate, px; 1 where the
             mask is False.
+        systematic: (B, L, P, 2, Q) or None: undistorted px by which a point is displaced per
+            standard deviation of each of Q independent errors that all points of an item share,
+            such as those of the head's geometry; 0 where the mask is False.
 
     Build one with `from_lists`, which checks its input. Everything is float64.
     """
@@ -39,6 +43,7 @@ class LinePatterns(Batched):
     image_size: Tensor
     offsets: Tensor | None = None
     sigma: Tensor | None = None
+    systematic: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 4 or self.points.shape[-1] != 2:
@@ -51,6 +56,7 @@ class LinePatterns(Batched):
             "image_size": (batch, 2),
             "offsets": self.points.shape,
             "sigma": inner,
+            "systematic": (*self.points.shape, *_last(self.systematic)),
         }
         for name, shape in expected.items():
             value = getattr(self, name)
@@ -69,6 +75,7 @@ class LinePatterns(Batched):
         image_size: Sequence,
         offsets: Sequence[Sequence[np.ndarray]] | None = None,
         sigma: Sequence[Sequence[np.ndarray]] | None = None,
+        systematic: Sequence[Sequence[np.ndarray]] | None = None,
     ) -> LinePatterns:
         """Stack ragged patterns.
 
@@ -77,6 +84,7 @@ class LinePatterns(Batched):
             image_size: (width, height) px of all pictures, or one per pattern.
             offsets: listed alike, (n, 2) undistorted px.
             sigma: listed alike, (n,) px.
+            systematic: listed alike, (n, 2, Q) undistorted px.
 
         Raises:
             ValueError: no pattern, a pattern without lines, a line of fewer than 3 points, wrong
@@ -105,8 +113,9 @@ class LinePatterns(Batched):
             torch.from_numpy(points),
             torch.from_numpy(mask),
             torch.from_numpy(sizes.copy()),
-            None if offsets is None else _stack_beside("offsets", offsets, lines, (*shape, 2), 0.0),
-            None if sigma is None else _stack_beside("sigma", sigma, lines, shape, 1.0),
+            _stack_beside("offsets", offsets, lines, (*shape, 2)),
+            _stack_beside("sigma", sigma, lines, shape),
+            _stack_beside("systematic", systematic, lines, (*shape, 2, "Q")),
         )
 
     def to_lists(self) -> list[list[np.ndarray]]:
@@ -121,32 +130,32 @@ class LinePatterns(Batched):
     def stack(cls, patterns: Sequence[LinePatterns]) -> LinePatterns:
         """One batch of several, padded to the largest.
 
-        Batches without offsets (or sigmas) get offsets of 0 (sigmas of 1) if another has them.
+        Batches without offsets (or sigmas) get offsets of 0 (sigmas of 1) if another has them;
+        systematic errors that a batch lacks displace nothing.
         """
         if len(patterns) == 0:
             raise ValueError("no patterns given")
         shape = [max(p.points.shape[axis] for p in patterns) for axis in (1, 2)]
 
-        def padded(name: str, fill: float, tail: tuple[int, ...] = ()) -> Tensor | None:
+        def padded(name: str, fill: float) -> Tensor | None:
             values = [getattr(p, name) for p in patterns]
-            if all(value is None for value in values):
+            there = [value for value in values if value is not None]
+            if not there:
                 return None
+            tail = [max(sizes) for sizes in zip(*(v.shape[3:] for v in there), strict=True)]
             out = []
             for p, value in zip(patterns, values, strict=True):
-                full = p.points.new_full((len(p), *shape, *tail), fill)
-                if name == "mask":
-                    full = full.bool()
+                full = there[0].new_full((len(p), *shape, *tail), fill, device=p.points.device)
                 if value is not None:
-                    full[:, : value.shape[1], : value.shape[2]] = value
+                    full[tuple(slice(size) for size in value.shape)] = value
                 out.append(full)
             return torch.cat(out)
 
         return cls(
-            padded("points", 0.0, (2,)),
-            padded("mask", 0.0),
+            padded("points", 0.0),
+            padded("mask", False),
             torch.cat([p.image_size for p in patterns]),
-            padded("offsets", 0.0, (2,)),
-            padded("sigma", 1.0),
+            **{name: padded(name, fill) for name, fill in _BESIDE.items()},
         )
 
     def save(self, path: str | Path) -> None:
@@ -178,7 +187,7 @@ class LinePatterns(Batched):
             patterns = cls(**{name: torch.from_numpy(value) for name, value in arrays.items()})
             beside = {
                 name: _lists(getattr(patterns, name), patterns.mask)
-                for name in ("offsets", "sigma")
+                for name in _BESIDE
                 if getattr(patterns, name) is not None
             }
             return cls.from_lists(patterns.to_lists(), patterns.image_size.numpy(), **beside)
@@ -212,17 +221,23 @@ def _checked_lines(index: int, lines: Sequence[np.ndarray], size: np.ndarray) ->
     return checked
 
 
+def _last(value: Tensor | None) -> tuple[int, ...]:
+    """The length of the last axis, where there is one."""
+    return () if value is None else tuple(value.shape[-1:])
+
+
 def _stack_beside(
     name: str,
-    values: Sequence[Sequence[np.ndarray]],
+    values: Sequence[Sequence[np.ndarray]] | None,
     lines: list[list[np.ndarray]],
-    shape: tuple[int, ...],
-    fill: float,
-) -> Tensor:
-    """Values listed like the points, padded like them."""
+    shape: tuple[int | str, ...],
+) -> Tensor | None:
+    """Values listed like the points, padded like them; an axis with a name is as long as found."""
+    if values is None:
+        return None
     if len(values) != len(lines):
         raise ValueError(f"{name}: {len(values)} patterns, but the points have {len(lines)}")
-    stacked = np.full(shape, fill)
+    stacked = None
     for i, item in enumerate(values):
         if len(item) != len(lines[i]):
             raise ValueError(
@@ -231,7 +246,10 @@ def _stack_beside(
         for j, value in enumerate(item):
             where = f"{name}, pattern {i}, line {j}"
             array = _array(value, where)
-            expected = (len(lines[i][j]), *shape[3:])
+            if stacked is None:
+                found = array.shape[-1] if array.ndim else 0
+                stacked = np.full([found if n == "Q" else n for n in shape], _BESIDE[name])
+            expected = (len(lines[i][j]), *stacked.shape[3:])
             if array.shape != expected:
                 raise ValueError(f"{where}: shape must be {expected}, not {array.shape}")
             if not np.isfinite(array).all():

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchptz.lens import RadialLens
-from torchptz.zoom_table_file import read_table, write_table
+from torchptz.zoom_table_file import COVARIANCES, read_table, write_table
 
 # Magnifications that differ by less than this part are the same one.
 _SAME_ZOOM = 1e-6
@@ -46,6 +46,8 @@ class Knot:
     gain_sigma: float | None = None
     # (2+K, 2+K), order (cx px, cy px, coefficients); inf on the diagonal of what is not known
     covariance: Tensor | None = None
+    # the same, of errors of the head's geometry, which no residual shows
+    systematic_covariance: Tensor | None = None
     focal_length_px: float | None = None  # px
     focal_length_sigma_px: float | None = None  # px
     points: int | None = None  # how many the fit saw
@@ -70,22 +72,24 @@ class Knot:
             )
         if self.lens is not None and not _is_finite(self.lens.center, self.lens.coefficients):
             object.__setattr__(self, "lens", None)
-        if self.lens is None:
-            object.__setattr__(self, "covariance", None)
         if usable and self.lens is None:
             raise ValueError(
                 f"{where}: status {self.status}, but its lens is missing or not finite"
             )
-        if self.covariance is not None:
-            covariance = torch.as_tensor(self.covariance, dtype=torch.float64)
-            size = 2 + len(self.lens.powers)
-            if covariance.shape != (size, size):
-                raise ValueError(
-                    f"{where}: covariance must have shape {(size, size)}, "
-                    f"not {tuple(covariance.shape)}"
-                )
-            known = not bool((covariance.isnan() | covariance.isneginf()).any())
-            object.__setattr__(self, "covariance", covariance if known else None)
+        for name in COVARIANCES:
+            object.__setattr__(self, name, self._checked_covariance(name, where))
+
+    def _checked_covariance(self, name: str, where: str) -> Tensor | None:
+        if self.lens is None or getattr(self, name) is None:
+            return None
+        covariance = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+        size = 2 + len(self.lens.powers)
+        if covariance.shape != (size, size):
+            raise ValueError(
+                f"{where}: {name} must have shape {(size, size)}, not {tuple(covariance.shape)}"
+            )
+        known = not bool((covariance.isnan() | covariance.isneginf()).any())
+        return covariance if known else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ Read by hand, knot ``k`` maps a picture point ``p`` to ``c + L(r) (p - c)`` with
 ``center``, ``L(r) = 1 + sum_i coefficients[i] r ** powers[i]`` and
 ``r = hypot(pixel_aspect (x - c_x), y - c_y) / scale``. ``zoom`` is the measured magnification,
 ``nominal_zoom`` the one that was asked for. A null inside of ``covariance`` stands for infinity:
-what was not estimated is not known.
+what was not estimated is not known. ``systematic_covariance`` is to be added to it.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ _NUMBERS = (
     "focal_length_sigma_px",
 )
 _COUNTS = ("points", "lines")
+COVARIANCES = ("covariance", "systematic_covariance")
 
 
 def write_table(table: ZoomTable, path: str | Path) -> None:
@@ -62,7 +63,7 @@ def write_table(table: ZoomTable, path: str | Path) -> None:
                 "usable": knot.usable,
                 "center": None if knot.lens is None else knot.lens.center[0].tolist(),
                 "coefficients": None if knot.lens is None else knot.lens.coefficients[0].tolist(),
-                "covariance": without_nan(_list(knot.covariance)),
+                **{name: without_nan(_list(getattr(knot, name))) for name in COVARIANCES},
                 **{name: getattr(knot, name) for name in (*_NUMBERS, *_COUNTS)},
             }
             for knot in table.knots
@@ -112,7 +113,7 @@ def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot
     usable = _field(knot, "usable", where)
     if not isinstance(usable, bool):
         raise ValueError(f"{where}usable must be true or false, not {usable!r}")
-    lens, covariance = None, None
+    lens, covariances = None, {}
     center = _array(knot, "center", where, (2,), optional=not usable)
     if center is not None:
         powers = _array(stored, "powers", "", (None,))
@@ -125,7 +126,9 @@ def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot
             "pixel_aspect": _array(stored, "pixel_aspect", "", ()),
         }
         size = 2 + len(powers)
-        covariance = _covariance(knot, where, size)
+        # Tables from before there were systematic ones lack them.
+        stated = {"systematic_covariance": None, **knot}
+        covariances = {name: _covariance(stated, name, where, size) for name in COVARIANCES}
     numbers = {name: _array(knot, name, where, (), optional=True) for name in _NUMBERS}
     counts = {name: _array(knot, name, where, (), optional=True) for name in _COUNTS}
     status, zoom = _text(knot, "status", where), _array(knot, "zoom", where, ())
@@ -135,7 +138,7 @@ def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot
             lens=None if lens is None else RadialLens(**lens),
             status=status,
             usable=usable,
-            covariance=covariance,
+            **covariances,
             **numbers,
             **{name: None if count is None else int(count) for name, count in counts.items()},
         )
@@ -170,12 +173,12 @@ def _array(
     return value
 
 
-def _covariance(knot: dict, where: str, size: int) -> object:
+def _covariance(knot: dict, name: str, where: str, size: int) -> object:
     """As `_array`, with null inside of the matrix for infinity."""
-    value = _field(knot, "covariance", where)
+    value = _field(knot, name, where)
     if value is None:
         return None
-    _array({"covariance": _filled(value, 0.0)}, "covariance", where, (size, size))
+    _array({name: _filled(value, 0.0)}, name, where, (size, size))
     return _filled(value, math.inf)
 
 

@@ -165,6 +165,22 @@ class TestHealthy:
         assert away < 5 * record.ray_sigma
         assert record.ray_sigma < math.radians(0.002)
 
+    def test_errors_of_the_head_are_named_and_in_the_patterns(self, healthy):
+        errors = healthy.record.head_errors
+        assert [*errors.values()] == pytest.approx(
+            [healthy.record.ray_sigma] * 2 + [math.radians(0.1), math.radians(math.hypot(0.1, 0.1))]
+        )
+        largest = []
+        for zoom in healthy.record.zooms:
+            patterns = patterns_of(healthy.folder, zoom)
+            assert patterns.systematic.shape[-1] == len(errors)
+            largest.append(patterns.systematic[patterns.mask].abs().amax((0, 1)))
+        # Of the ray as far as f, of the rest as much as it turns over the field of view.
+        focal = [zoom.focal_length_px for zoom in healthy.record.zooms]
+        for found, length in zip(largest, focal, strict=True):
+            assert float(found[0]) == pytest.approx(length * healthy.record.ray_sigma, rel=0.5)
+        assert 0.05 < float(largest[0][2]) < 0.5
+
     def test_the_true_lens_and_the_offsets_straighten_every_line(self, healthy):
         truth = CameraTruth.of(healthy.simulated)
         worst, without = [], []

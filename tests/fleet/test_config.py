@@ -34,6 +34,7 @@ class TestDefaults:
         assert (scan.horizontal, scan.vertical, scan.oblique) == (12, 10, 0)
         assert (scan.points_per_line, scan.tracks) == (20, 8)
         assert (one.pixel_aspect, one.pan_sign, one.tilt_sign) == (1.0, 1, 1)
+        assert (one.tilt_zero_sigma_deg, one.boresight_sigma_deg) == (0.1, 0.1)
         assert one.feature.kind == "ball"
         assert one.feature.direction() is None
         assert one.resolve_credentials() is None

@@ -18,6 +18,7 @@ def record() -> CameraRecord:
         principal_point_covariance=[[0.1, 0.0], [0.0, 0.2]],
         ray=[0.0, 0.6, 0.8],
         ray_sigma=1e-4,
+        head_errors={"ray left": 1e-4, "boresight left": 2e-3},
         feature={"kind": "ball"},
         zooms=[
             ZoomRecord(nominal_zoom=2.0, zoom_units=5638.0, magnification=2.1, lines=3, points=60)
@@ -29,6 +30,14 @@ class TestFile:
     def test_a_record_comes_back_as_it_was(self, tmp_path):
         record().save(tmp_path)
         assert CameraRecord.load(tmp_path) == record()
+
+    def test_one_from_before_errors_of_the_head_were_kept_is_read(self, tmp_path):
+        record().save(tmp_path)
+        path = tmp_path / "camera.json"
+        stored = json.loads(path.read_text())
+        assert [*stored.pop("head_errors")] == ["ray left", "boresight left"]  # in their order
+        path.write_text(json.dumps(stored))
+        assert CameraRecord.load(tmp_path) == record().model_copy(update={"head_errors": {}})
 
     def test_it_names_its_schema(self, tmp_path):
         record().save(tmp_path)

@@ -1,12 +1,13 @@
 """solve: every camera's tables from one run, whatever became of the others."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 
 from tests import synthetic
-from torchptz.estimation import estimate
+from torchptz.estimation import Status, estimate
 from torchptz.fleet import solve as module
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.fleet.solve import solve
@@ -150,10 +151,103 @@ class TestUnknownCenter:
         collected(tmp_path, "a", (1.0, straight))
         assert solve(tmp_path).cameras["a"].zooms[0].status == "CENTER_UNOBSERVABLE"
         (knot,) = ZoomTable.load(tmp_path / "a" / "table.json").knots
-        assert torch.equal(knot.covariance.diagonal()[:2], torch.full((2,), torch.inf).double())
         expected = estimate(straight).covariance[0]
-        assert torch.allclose(knot.covariance[2:, 2:], expected[2:, 2:], rtol=1e-6)
-        assert bool((knot.covariance.diagonal()[2:] > 0).all())
+        assert torch.allclose(knot.covariance, expected, rtol=1e-6)
+        assert bool((knot.covariance.diagonal() > 0).all())
+        assert bool((knot.covariance.diagonal()[:2] > 20**2).all())  # nothing was known of it
+
+    def test_a_measured_principal_point_stands_in_for_it(self, tmp_path):
+        straight = of(synthetic.lens((0.0, 0.0, 0.0)))
+        known = {
+            "principal_point": [325.0, 236.0],
+            "principal_point_covariance": [[0.5, 0.1], [0.1, 0.25]],
+        }
+        collected(tmp_path, "a", (1.0, straight), **known)
+        assert solve(tmp_path).cameras["a"].zooms[0].status == "CENTER_UNOBSERVABLE"
+        (knot,) = ZoomTable.load(tmp_path / "a" / "table.json").knots
+        assert knot.lens.center.tolist() == [[325.0, 236.0]]
+        # Give or take 5 px: the distortion has a centre of its own.
+        assert torch.allclose(knot.covariance[:2, :2], synthetic.double(25.5, 0.1, 0.1, 25.25)
+                              .reshape(2, 2))  # fmt: skip
+
+
+class TestPriorOnTheCentre:
+    """From the principal point, where one was measured."""
+
+    known = {  # noqa: RUF012
+        "principal_point": [326.0, 232.0],
+        "principal_point_covariance": [[0.0, 0.0], [0.0, 0.0]],
+    }
+
+    def test_it_keeps_the_centre_of_few_points_near(self, tmp_path):
+        sparse = synthetic.noisy(synthetic.pattern_of(BARREL, lines=8, points=8), 0.5, seed=1)
+        collected(tmp_path, "free", (1.0, sparse))
+        collected(tmp_path, "known", (1.0, sparse), **self.known)
+        solve(tmp_path)
+        knots = [
+            ZoomTable.load(tmp_path / name / "table.json").knots[0] for name in ("free", "known")
+        ]
+        off = [float((k.lens.center - synthetic.double(326, 232)).norm()) for k in knots]
+        assert off[1] < off[0]
+        free, known = (knot.covariance.diagonal()[:2] for knot in knots)
+        assert bool((known < free).all())
+        assert bool((known < 25).all())
+
+    def test_the_paper_s_method_knows_none(self, tmp_path):
+        collected(tmp_path, "free", (1.0, of(BARREL)))
+        collected(tmp_path, "known", (1.0, of(BARREL)), **self.known)
+        solve(tmp_path, method="lanz")
+        free, known = (
+            ZoomTable.load(tmp_path / name / "table.json").lens.center for name in ("free", "known")
+        )
+        assert torch.allclose(free, known, atol=1e-3)  # but for where the loop started
+
+
+class TestSigmas:
+    def test_they_are_those_of_the_worst_point_of_the_picture(self, run):
+        zoom = solve(run).cameras["a"].zooms[0]
+        (knot, _) = ZoomTable.load(run / "a" / "table.json").knots
+        grid = torch.from_numpy(synthetic.grid(synthetic.PAPER_SIZE))[None]
+        sigma = knot.lens.displacement_sigma(grid, knot.covariance[None])
+        assert zoom.sigma_px == pytest.approx(float(sigma.max()), rel=1e-6)
+        assert zoom.systematic_px is None  # nothing is known of a head
+        assert knot.systematic_covariance is None
+
+    def test_errors_of_the_head_are_reported_apart(self, tmp_path):
+        """Beside a camera without a head, in the same batch."""
+        bare = of(BARREL)
+        shaken = replace(bare, systematic=torch.zeros(*bare.points.shape, 1).double())
+        away = (bare.points - synthetic.double(320, 240)) / 320
+        shaken.systematic[..., 0, 0] = away[..., 0] * away[..., 1]
+        shaken.systematic[..., 1, 0] = 2 * away[..., 1] ** 3
+        shaken.systematic[~bare.mask] = 0
+        collected(tmp_path, "ptz", (1.0, shaken))
+        collected(tmp_path, "photos", (1.0, bare))
+        summary = solve(tmp_path)
+        ptz, photos = (summary.cameras[name].zooms[0] for name in ("ptz", "photos"))
+        assert ptz.rms_px == photos.rms_px
+        assert ptz.sigma_px == photos.sigma_px
+        assert photos.systematic_px is None
+        assert ptz.systematic_px > 0.5
+        (knot,) = ZoomTable.load(tmp_path / "ptz" / "table.json").knots
+        expected = estimate(shaken).systematic_covariance[0]
+        assert torch.allclose(knot.systematic_covariance, expected, rtol=1e-5)
+        stored = json.loads((tmp_path / "summary.json").read_text())["cameras"]
+        assert stored["ptz"]["zooms"][0]["systematic_px"] == ptz.systematic_px
+
+
+class TestOutliers:
+    def test_a_lens_that_nobody_can_tell_from_its_outliers_is_not_used(self, tmp_path, monkeypatch):
+        def ridden(patterns, *args, **options):
+            fit = estimate(patterns, *args, **options)
+            return replace(fit, status=[Status.OUTLIERS] * len(patterns))
+
+        monkeypatch.setattr(module, "estimate", ridden)
+        collected(tmp_path, "a", (1.0, of(BARREL)))
+        result = solve(tmp_path).cameras["a"]
+        assert not result.ok
+        assert result.table is None
+        assert "lie off their lines" in result.zooms[0].error
 
 
 class TestOnlySomeCameras:

@@ -7,7 +7,6 @@ from torch import Tensor
 
 from torchptz.estimation.lines import fit_lines, project_out_lines
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.residuals import distance_gradient
 
 _FARTHEST_STEP = 0.1  # units of r: beyond it the quadratic model of the objective is no guide
 _HALVINGS = 8
@@ -103,3 +102,31 @@ def _backtrack(
             break
         step = step / 2
     return moved
+
+
+def distance_gradient(
+    problem: Problem, center: Tensor, coefficients: Tensor, normal: Tensor
+) -> Tensor:
+    """Gradient of the distance to a line with respect to the measured point.
+
+    Args:
+        problem: B items.
+        center: (B, 2) px.
+        coefficients: (B, K).
+        normal: (B, L, 2) unit normals of the lines.
+
+    Returns:
+        (B, L, P, 2) ``(dp^/dp)^t n``; as ``p^`` depends on p - c, and on c once more, the gradient
+        with respect to the centre is ``n`` less this.
+    """
+    offset = problem.from_center(center)
+    radius = problem.radius(center).unsqueeze(-1)
+    radius = torch.where(radius > 0, radius, 1e-12)
+    basis = problem.basis(radius.squeeze(-1))
+    shaped = torch.stack([coefficients, problem.powers * coefficients], -1)
+    # dL/dp = (sum_k p_k l_k r^(p_k - 2)) (a² x, y) / scale²
+    correction, falling = (basis @ shaped[:, None]).split(1, -1)
+    correction, falling = 1 + correction, falling / radius**2
+    n = normal[:, :, None]
+    lever = (offset * n).sum(-1, keepdim=True)
+    return correction * n + lever * falling * problem.metric(offset)

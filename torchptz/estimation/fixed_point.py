@@ -109,6 +109,38 @@ def iterate(
     )
 
 
+def fixed_point_step(
+    problem: Problem,
+    center: Tensor,
+    coefficients: Tensor,
+    gain: Tensor | None = None,
+    hold_center: Tensor | None = None,
+    free_l0: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """One iteration: centre step, lines fitted again, coefficient step.
+
+    Args:
+        problem: B items.
+        center: (B, 2) px.
+        coefficients: (B, K).
+        gain: (B,) of the known offsets, or None to leave them out.
+        hold_center: (B,) bool, items whose centre is not moved.
+        free_l0: see `solve_coefficients`.
+
+    Returns:
+        center (B, 2) px and coefficients (B, K).
+
+    Source: paper, section 2.
+    """
+    moved = center_step(problem, center, coefficients, gain)
+    if hold_center is not None:
+        moved = torch.where(hold_center.unsqueeze(-1), center, moved)
+    # The lines are fitted again after the centre moved: with stale ones the loop ends in a cycle
+    # of period two on noisy data.
+    lines = fit_lines(problem.correct(moved, coefficients, gain), problem.weight)
+    return moved, solve_coefficients(problem, moved, lines, gain, free_l0)
+
+
 @dataclass(frozen=True, eq=False)
 class _State(Batched):
     center: Tensor
@@ -148,13 +180,7 @@ def _advance(
                 converged, active = converged | done, active & ~done
         if not active.any():
             break
-        moved = center_step(problem, center, coefficients, gain)
-        if hold_center is not None:
-            moved = torch.where(hold_center.unsqueeze(-1), center, moved)
-        # The lines are fitted again after the centre moved: with stale ones the loop ends in a
-        # cycle of period two on noisy data.
-        lines = fit_lines(problem.correct(moved, coefficients, gain), problem.weight)
-        solved = solve_coefficients(problem, moved, lines, gain, free_l0)
+        moved, solved = fixed_point_step(problem, center, coefficients, gain, hold_center, free_l0)
         # A blown-up item keeps its last good state and stops alone; the SVDs of the others never
         # see its numbers.
         active = active & solved.isfinite().all(-1) & (solved.abs().amax(-1) < _BLOWN_UP)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 from torchptz.batch import Batched
 from torchptz.patterns import LinePatterns
+
+_MOST_FACTORS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,46 +24,90 @@ class Problem(Batched):
     """
 
     points: Tensor  # (B, L, P, 2) px
-    weight: Tensor  # (B, L, P), 0 for padding, mean 1 over an item's points
+    mask: Tensor  # (B, L, P), where a point is
+    weight: Tensor  # (B, L, P), 0 where it is not used, mean 1 over an item's used points
     offsets: Tensor | None  # (B, L, P, 2) undistorted px
     image_size: Tensor  # (B, 2) px
     scale: Tensor  # (B,) px per unit of r
     pixel_aspect: Tensor  # (B,)
     powers: Tensor  # (K,)
+    exponents: tuple[float, ...]  # the same as plain numbers
+    gain_per_axis: bool = False
 
-    _shared: ClassVar[frozenset[str]] = frozenset({"powers"})
+    _shared: ClassVar[frozenset[str]] = frozenset({"powers", "exponents", "gain_per_axis"})
 
     @classmethod
     def from_patterns(
-        cls, patterns: LinePatterns, powers: Tensor, pixel_aspect: Tensor | float = 1.0
+        cls,
+        patterns: LinePatterns,
+        powers: Tensor,
+        pixel_aspect: Tensor | float = 1.0,
+        gain_per_axis: bool = False,
     ) -> Problem:
-        """In float64, whatever the patterns are in. Weights are 1/sigma² where sigmas are given."""
-        weight = patterns.mask.double()
+        """In float64, whatever the patterns are in. Weights are 1/sigma² where sigmas are given.
+
+        Points that are not finite are left out.
+        """
+        points, offsets = patterns.points.double(), patterns.offsets
+        mask = patterns.mask & points.isfinite().all(-1)
+        if offsets is not None:
+            offsets = offsets.double()
+            mask = mask & offsets.isfinite().all(-1)
+            offsets = torch.where(mask.unsqueeze(-1), offsets, 0.0)
+        weight = mask.double()
         if patterns.sigma is not None:
-            weight = weight / patterns.sigma.double() ** 2
-            mean = weight.sum((1, 2), keepdim=True) / patterns.mask.sum((1, 2), keepdim=True)
-            weight = weight / mean
-        size, offsets = patterns.image_size.double(), patterns.offsets
-        return cls(
-            points=patterns.points.double(),
+            sigma = patterns.sigma.double()
+            usable = mask & sigma.isfinite() & (sigma > 0)
+            weight = torch.where(usable, 1 / torch.where(usable, sigma, 1.0) ** 2, 0.0)
+        size = patterns.image_size.double()
+        problem = cls(
+            points=torch.where(mask.unsqueeze(-1), points, size[:, None, None] / 2),
+            mask=mask,
             weight=weight,
-            offsets=None if offsets is None else offsets.double(),
+            offsets=offsets,
             image_size=size,
             scale=size[:, 0] / 2,
             pixel_aspect=torch.as_tensor(pixel_aspect, dtype=size.dtype, device=size.device).expand(
                 len(size)
             ),
             powers=powers.to(size.device),
+            exponents=tuple(powers.tolist()),
+            gain_per_axis=gain_per_axis,
+        )
+        return problem.using(weight > 0)
+
+    def using(self, inliers: Tensor) -> Problem:
+        """The same problem with the points (B, L, P) bool only, weights renewed to mean 1."""
+        weight = torch.where(inliers, self.weight, 0.0)
+        count = (weight > 0).sum((1, 2), keepdim=True)
+        total = weight.sum((1, 2), keepdim=True)
+        return replace(self, weight=weight * torch.where(total > 0, count / total, 0.0))
+
+    def with_powers(self, powers: Sequence[float]) -> Problem:
+        """The same problem for a lens of other powers."""
+        return replace(
+            self, powers=self.powers.new_tensor(powers), exponents=tuple(map(float, powers))
         )
 
     @property
+    def middle(self) -> Tensor:
+        """(B, 2) px, of the picture."""
+        return (self.image_size - 1) / 2
+
+    @property
+    def unknowns(self) -> int:
+        """M: centre, coefficients and gains."""
+        gains = 0 if self.offsets is None else 1 + self.gain_per_axis
+        return 2 + len(self.powers) + gains
+
+    @property
     def count(self) -> Tensor:
-        """(B,) points."""
+        """(B,) points used."""
         return (self.weight > 0).sum((1, 2))
 
     @property
     def line_count(self) -> Tensor:
-        """(B,) lines."""
+        """(B,) lines used."""
         return (self.weight > 0).any(-1).sum(-1)
 
     def from_center(self, center: Tensor) -> Tensor:
@@ -84,15 +131,32 @@ class Problem(Batched):
 
     def radial_powers(self, center: Tensor) -> Tensor:
         """(B, L, P, K): r^powers."""
-        radius = self.radius(center).unsqueeze(-1)
+        radius = self.radius(center)
         away = radius > 0
-        return torch.where(away, torch.where(away, radius, 1.0) ** self.powers, 0.0)
+        basis = self.basis(torch.where(away, radius, 1.0))
+        return torch.where(away.unsqueeze(-1), basis, 0.0)
+
+    def basis(self, radius: Tensor) -> Tensor:
+        """(..., K): powers of a radius (...) > 0. Whole ones are multiplied up: pow is slow."""
+        columns, last, reached = [], None, 0.0
+        for exponent in self.exponents:
+            gap = exponent - reached
+            if gap.is_integer() and gap <= _MOST_FACTORS:
+                for _ in range(int(gap)):
+                    last = radius if last is None else last * radius
+            else:
+                last = radius**exponent
+            columns.append(last)
+            reached = exponent
+        return torch.stack(columns, -1)
 
     def correct(self, center: Tensor, coefficients: Tensor, gain: Tensor | None = None) -> Tensor:
         """Undistorted points, moved onto their lines by ``gain`` times the known offsets.
 
         Args:
-            center: (B, 2) px. coefficients: (B, K). gain: (B,); None leaves the offsets out.
+            center: (B, 2) px.
+            coefficients: (B, K).
+            gain: (B, 1), (B, 2) for one per axis, or (B,); None leaves the offsets out.
 
         Returns:
             (B, L, P, 2) px.
@@ -101,4 +165,4 @@ class Problem(Batched):
         corrected = center[:, None, None] + correction.unsqueeze(-1) * self.from_center(center)
         if gain is None or self.offsets is None:
             return corrected
-        return corrected - gain[:, None, None, None] * self.offsets
+        return corrected - gain.reshape(len(gain), 1, 1, -1) * self.offsets

@@ -1,4 +1,4 @@
-"""Joint step: centre, coefficients, gain and lines at once, in distorted pixels."""
+"""Joint step: centre, coefficients, gains and lines at once, in distorted pixels."""
 
 from __future__ import annotations
 
@@ -7,37 +7,122 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchptz.estimation.lines import Lines, project_out_lines
+from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.residuals import Straightness, distance_gradient, straightness
+from torchptz.estimation.residuals import State, derivatives
 
-_MAX_STEPS = 60
-_DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
-# Promised fall of the cost, relative: a thousandth of a sigma of the estimate, squared.
-_FALL_TOLERANCE = 1e-9
-_EXACT_PX = 1e-10  # rms residual of noise-free points; rounding keeps it from falling further
+_ROUND = 5  # steps between two looks at which items are still active
+_DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-15, 1e10
+# An undamped step's promised fall of the cost, relative to the noise variance, is its squared
+# length in standard deviations. An item is settled when that is next to rounding, ...
+_SETTLED = 1e-22
+# ... and good enough at a thousandth of a standard deviation, should it get stuck before.
+_CONVERGED = 1e-6
+# Of the half width. Residuals of exact points are not smaller, ...
+_ROUNDING = 1e-14
+_EXACT = 1e-12  # ... and these are exact.
+_SLACK = 1e-12  # relative, of the cost
 _FARTHEST_STEP = 0.2  # units of r, for the centre
+_LINE_STEPS = 6
 
 
-@dataclass(frozen=True)
-class Refined:
+@dataclass(frozen=True, eq=False)
+class Prior(Batched):
+    """What is known of theta beforehand: a Gaussian, without information where nothing is."""
+
+    mean: Tensor  # (B, M)
+    information: Tensor  # (B, M, M), inverse covariance
+
+    def value(self, theta: Tensor) -> Tensor:
+        """(B,) squared Mahalanobis distance of theta (B, M)."""
+        away = theta - self.mean
+        return torch.einsum("bi,bij,bj->b", away, self.information, away)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised(Batched):
+    """The problem about a state, lines eliminated; all of it small."""
+
+    cost: Tensor  # (B,) px², weighted sum of squared residuals
+    normal: Tensor  # (B, M, M)
+    right: Tensor  # (B, M), minus half the gradient of the cost
+    line_factor: Tensor  # (B, L, 3): lengths of a line's two columns and the part of one along both
+    line_theta: Tensor  # (B, L, 2, M): columns of theta along the line's
+    line_residual: Tensor  # (B, L, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Refined(Batched):
     """Where the joint step ended, per item."""
 
-    center: Tensor  # (B, 2) px
-    coefficients: Tensor  # (B, K)
-    gain: Tensor | None  # (B,)
+    state: State
     iterations: Tensor  # (B,) int, accepted and rejected steps alike
     converged: Tensor  # (B,) bool
 
 
+def linearise(problem: Problem, state: State) -> Linearised:
+    """Normal equations of theta with the lines projected out.
+
+    Each line's own two columns (angle and offset) are orthogonalised; what of theta's columns and
+    of the residuals lies along them is what refitting the line takes up.
+
+    Args:
+        problem: B items.
+        state: where.
+
+    Returns:
+        Linearised.
+
+    Source: variable projection (Golub and Pereyra 1973; Kaufman 1975).
+    """
+    return reduce_lines(problem, *derivatives(problem, state)[:3])[0]
+
+
+def reduce_lines(
+    problem: Problem, residual: Tensor, by_theta: Tensor, by_line: Tensor
+) -> tuple[Linearised, Tensor, Tensor]:
+    """`linearise` from the derivatives, with the projected columns (B, L, P, M) and residuals.
+
+    Columns of theta may be any columns: (B, L, P, M).
+    """
+    used = problem.weight > 0
+    root = problem.weight.sqrt()
+    tiny = torch.finfo(root.dtype).tiny
+    residual = torch.where(used, residual, 0.0) * root
+    columns = torch.where(used.unsqueeze(-1), by_theta, 0.0) * root.unsqueeze(-1)
+    by_line = torch.where(used.unsqueeze(-1), by_line, 0.0) * root.unsqueeze(-1)
+    turn, shift = by_line.unbind(-1)
+    shift_length = (shift**2).sum(-1, keepdim=True).clamp_min(tiny).sqrt()
+    first = shift / shift_length
+    along = (first * turn).sum(-1, keepdim=True)
+    second = turn - along * first
+    turn_length = (second**2).sum(-1, keepdim=True).clamp_min(tiny).sqrt()
+    bases = torch.stack([first, second / turn_length], -2)  # (B, L, 2, P)
+    line_theta = bases @ columns
+    line_residual = (bases @ residual.unsqueeze(-1)).squeeze(-1)
+    cost = (residual**2).sum((1, 2))
+    columns = columns - bases.mT @ line_theta
+    residual = residual - (bases.mT @ line_residual.unsqueeze(-1)).squeeze(-1)
+    flat = columns.flatten(1, 2)
+    linear = Linearised(
+        cost,
+        flat.mT @ flat,
+        -(flat.mT @ residual.flatten(1).unsqueeze(-1)).squeeze(-1),
+        torch.cat([shift_length, turn_length, along], -1),
+        line_theta,
+        line_residual,
+    )
+    return linear, columns, residual
+
+
 def refine(
     problem: Problem,
-    center: Tensor,
-    coefficients: Tensor,
-    gain: Tensor | None,
-    hold_center: Tensor | None = None,
+    state: State,
+    free: Tensor,
+    prior: Prior | None = None,
+    max_steps: int = 150,
 ) -> Refined:
-    """Damped Gauss-Newton on (c, l, gain) with the lines projected out.
+    """Damped Gauss-Newton on theta and the lines, the lines eliminated from every step.
 
     A loop that alternates the gain of the known offsets with the lines stalls at the long end of
     the zoom, where the offsets are larger than the distortion; solved together it takes a few
@@ -45,132 +130,145 @@ def refine(
 
     Args:
         problem: B items.
-        center: (B, 2) px, start.
-        coefficients: (B, K), start.
-        gain: (B,), start; None where the problem has no offsets.
-        hold_center: (B,) bool, items whose centre is not moved.
+        state: start.
+        free: (B, M) bool, the parameters to be moved.
+        prior: on theta. The noise variance that it is weighed against is the residuals' own.
+        max_steps: per item.
 
     Returns:
-        Refined. Damping, acceptance and the active mask are per item.
+        Refined. Damping, acceptance and the active mask are per item; items that are settled leave
+        the batch every few steps.
+
+    Source: Levenberg and Marquardt; README, "Beyond the paper".
     """
-    state = pack(center, coefficients, gain)
-    now = straightness(problem, center, coefficients, gain)
-    damping = torch.full_like(now.cost, _DAMPING_START)
-    active = now.cost.isfinite()
-    converged = torch.zeros_like(active)
-    iterations = torch.zeros_like(active, dtype=torch.long)
-    for _ in range(_MAX_STEPS):
-        columns, residual = jacobian(problem, state, now)
-        if hold_center is not None:
-            is_center = torch.arange(columns.shape[-1], device=columns.device) < 2
-            columns = torch.where(hold_center[:, None, None] & is_center, 0.0, columns)
-        normal = columns.transpose(1, 2) @ columns
-        right = -(columns.transpose(1, 2) @ residual.unsqueeze(-1)).squeeze(-1)
-        # What an undamped step promises, however much the next one is damped: a step that is small
-        # only because its damping is high does not pass for convergence.
-        promised = (right * _solve_damped(normal, right, torch.zeros_like(damping))).sum(-1)
-        done = active & (promised <= _FALL_TOLERANCE * now.cost + _EXACT_PX**2 * problem.count)
-        converged, active = converged | done, active & ~done
-        if not active.any():
+    progress = _Progress(
+        state,
+        linearise(problem, state),
+        torch.full_like(problem.scale, _DAMPING_START),
+        torch.zeros_like(problem.scale, dtype=torch.long),
+        torch.zeros_like(problem.scale, dtype=torch.bool),
+        torch.ones_like(problem.scale, dtype=torch.bool),
+    )
+    for begun in range(0, max_steps, _ROUND):
+        rows = progress.active.nonzero()[:, 0]
+        if len(rows) == 0:
             break
-        step = _solve_damped(normal, right, damping)
-        length = torch.linalg.vector_norm(step[:, :2], dim=-1).clamp_min(1e-300)
-        step = step * (_FARTHEST_STEP * problem.scale / length).clamp(max=1.0)[:, None]
-        trial = straightness(problem, *unpack(state + step, problem))
-        better = active & (trial.cost <= now.cost)
-        iterations = iterations + active
-        state = torch.where(better[:, None], state + step, state)
-        now = _choose(better, trial, now)
-        damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
-        active = active & (damping < _DAMPING_HIGHEST)
-    return Refined(*unpack(state, problem), iterations, converged)
+        everyone = len(rows) == len(free)
+        part = _advance(
+            *(problem, progress, free, prior)
+            if everyone
+            else (
+                problem[rows],
+                progress[rows],
+                free[rows],
+                None if prior is None else prior[rows],
+            ),
+            min(_ROUND, max_steps - begun),
+        )
+        progress = part if everyone else progress.with_items(rows, part)
+    return Refined(progress.state, progress.iterations, progress.converged)
 
 
-def pack(center: Tensor, coefficients: Tensor, gain: Tensor | None) -> Tensor:
-    """(B, 2 + K (+ 1)) parameters in the order of the covariance: cx, cy, l..., gain."""
-    return torch.cat([center, coefficients] + ([] if gain is None else [gain[:, None]]), 1)
-
-
-def unpack(state: Tensor, problem: Problem) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Inverse of `pack`."""
-    count = 2 + len(problem.powers)
-    return state[:, :2], state[:, 2:count], state[:, count] if state.shape[1] > count else None
-
-
-def jacobian(problem: Problem, state: Tensor, now: Straightness) -> tuple[Tensor, Tensor]:
-    """Weighted residuals and their derivatives, with the lines projected out of both.
+def settle_lines(problem: Problem, state: State) -> State:
+    """Lines that minimise the residuals for the theta at hand.
 
     Args:
         problem: B items.
-        state: (B, M) from `pack`.
-        now: `straightness` at that state.
-
-    Returns:
-        columns (B, N, M) and residual (B, N), N = L P. The columns hold the derivative of the
-        residual's own divisor too: with frozen divisors the iteration stalls off the optimum.
+        state: lines near their optimum, such as total least squares lines.
     """
-
-    center, coefficients, gain = unpack(state, problem)
-    n = now.lines.normal[:, :, None]
-    g = now.gradient.unsqueeze(-1)
-    distance = now.residual.unsqueeze(-1) * g
-    offset = problem.from_center(center)
-    lever = (offset * n).sum(-1, keepdim=True)
-    metric = problem.metric(offset)
-    radius = problem.radius(center).unsqueeze(-1)
-    radius = torch.where(radius > 0, radius, 1e-12)
-    powers, shaped = problem.powers, coefficients[:, None, None]
-    first = (powers * radius ** (powers - 2) * shaped).sum(-1, keepdim=True)
-    second = (powers * (powers - 2) * radius ** (powers - 4) * shaped).sum(-1, keepdim=True)
-
-    # The residual is d / |v| with v = (dp^/dp)^t n; the derivative of |v| follows from v . dv.
-    v = distance_gradient(problem, center, coefficients, now.lines.normal)
-    along_n = (v * n).sum(-1, keepdim=True)
-    along_metric = (v * metric).sum(-1, keepdim=True)
-    by_offset = (
-        first * (along_n * metric + along_metric * n + lever * problem.metric(v))
-        + lever * second * along_metric * metric
-    )
-    by_center = (n - v) / g + distance * by_offset / g**3
-    by_l = radius**powers * along_n + lever * powers * radius ** (powers - 2) * along_metric
-    by_coefficients = lever * radius**powers / g - distance * by_l / g**3
-    columns = [by_center, by_coefficients]
-    if gain is not None:
-        columns.append(-(problem.offsets * n).sum(-1, keepdim=True) / g)
-    columns = torch.cat(columns, -1)
-    columns = _without_lines(columns, problem, now.corrected, now.lines, now.gradient)
-    own = _without_lines(
-        now.residual.unsqueeze(-1), problem, now.corrected, now.lines, now.gradient
-    )
-    return columns.flatten(1, 2), own.flatten(1)
+    for _ in range(_LINE_STEPS):
+        residual, _, by_line, _ = derivatives(problem, state)
+        nothing = residual.new_zeros(*residual.shape, 0)
+        linear, _, _ = reduce_lines(problem, residual, nothing, by_line)
+        still = state.theta.new_zeros(len(problem), 0)
+        step = _line_step(linear, still)
+        state = state.moved(State(torch.zeros_like(state.theta), step[..., 0], step[..., 1]))
+    return state
 
 
-def _without_lines(
-    columns: Tensor, problem: Problem, corrected: Tensor, lines: Lines, gradient: Tensor
-) -> Tensor:
-    columns = torch.where(problem.weight.unsqueeze(-1) > 0, columns, 0.0)
-    return project_out_lines(columns, problem.weight, corrected, lines, gradient)
+@dataclass(frozen=True, eq=False)
+class _Progress(Batched):
+    state: State
+    linear: Linearised
+    damping: Tensor
+    iterations: Tensor
+    converged: Tensor
+    active: Tensor
 
 
-def _solve_damped(normal: Tensor, right: Tensor, damping: Tensor) -> Tensor:
-    """Marquardt step (B, M); 0 where the system cannot be solved."""
+def _advance(
+    problem: Problem, progress: _Progress, free: Tensor, prior: Prior | None, steps: int
+) -> _Progress:
+    """Up to ``steps`` steps of every active item, without a look at the result in between."""
+    state, linear, damping = progress.state, progress.linear, progress.damping
+    iterations, converged, active = progress.iterations, progress.converged, progress.active
+    freedom = (problem.count - 2 * problem.line_count - free.sum(-1)).clamp_min(1)
+    rounding = (_ROUNDING * problem.scale) ** 2
+    unit = torch.ones_like(free, dtype=damping.dtype)
+    unit[:, :2] = problem.scale[:, None]
+    active = active & linear.cost.isfinite()
+
+    def merit(linear: Linearised, state: State) -> Tensor:
+        # The noise variance profiled out: its logarithm weighs the data against the prior.
+        value = (linear.cost + problem.count * rounding).log()
+        return value if prior is None else value + prior.value(state.theta) / freedom
+
+    level = merit(linear, state)
+    for _ in range(steps):
+        variance = linear.cost / freedom
+        normal, right = linear.normal, linear.right
+        if prior is not None:
+            information = variance[:, None, None] * prior.information
+            away = (prior.mean - state.theta).unsqueeze(-1)
+            normal, right = normal + information, right + (information @ away).squeeze(-1)
+        normal, right = masked(normal, free), torch.where(free, right, 0.0)
+        # What an undamped step promises, however much the next one is damped: a step that is small
+        # only because its damping is high does not pass for convergence.
+        undamped = _solve_damped(normal, right, torch.zeros_like(damping), unit)
+        promised = (right * undamped).sum(-1)
+        converged = promised <= _CONVERGED * variance + (_EXACT * problem.scale) ** 2
+        active = active & (promised > _SETTLED * variance + rounding)
+        theta_step = _solve_damped(normal, right, damping, unit)
+        length = torch.linalg.vector_norm(theta_step[:, :2], dim=-1).clamp_min(1e-300)
+        theta_step = theta_step * (_FARTHEST_STEP * problem.scale / length).clamp(max=1.0)[:, None]
+        line_step = _line_step(linear, theta_step)
+        trial = state.moved(State(theta_step, line_step[..., 0], line_step[..., 1]))
+        trial_linear = linearise(problem, trial)
+        trial_level = merit(trial_linear, trial)
+        # Rounding must not decide whether the last steps count.
+        slack = _SLACK + 2 * (problem.count * rounding / linear.cost.clamp_min(1e-300)).sqrt()
+        better = active & (trial_level <= level + slack)
+        iterations = iterations + active
+        state = trial.where(better, state)
+        linear = trial_linear.where(better, linear)
+        level = torch.where(better, trial_level, level)
+        damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
+        active = active & (damping < _DAMPING_HIGHEST)
+    return _Progress(state, linear, damping, iterations, converged, active)
+
+
+def masked(normal: Tensor, free: Tensor) -> Tensor:
+    """Normal matrix (B, M, M) with the parameters that are not ``free`` (B, M) held."""
+    both = free[:, :, None] & free[:, None]
+    return torch.where(both, normal, 0.0) + torch.diag_embed((~free).to(normal))
+
+
+def _line_step(linear: Linearised, theta_step: Tensor) -> Tensor:
+    """(B, L, 2): angle and offset that answer a step of theta, by back-substitution."""
+    shift_length, turn_length, along = linear.line_factor.unbind(-1)
+    left = -linear.line_residual - (linear.line_theta @ theta_step[:, None, :, None]).squeeze(-1)
+    angle = torch.where(turn_length > 1e-100, left[..., 1] / turn_length, 0.0)
+    offset = torch.where(shift_length > 1e-100, (left[..., 0] - along * angle) / shift_length, 0.0)
+    return torch.stack([angle, offset], -1)
+
+
+def _solve_damped(normal: Tensor, right: Tensor, damping: Tensor, unit: Tensor) -> Tensor:
+    """Marquardt step (B, M) for parameters of the order of ``unit``; 0 where there is none."""
+    normal = normal * (unit[:, :, None] * unit[:, None])
     diagonal = normal.diagonal(dim1=1, dim2=2)
     # Columns that carry nothing (the centre's while L is 1) must not divide by zero: their
     # parameter then stays where it is.
-    floor = 1e-12 * diagonal.amax(-1, keepdim=True).clamp_min(1e-300)
+    floor = 1e-14 * diagonal.amax(-1, keepdim=True).clamp_min(1e-300)
     damped = normal + torch.diag_embed(damping[:, None] * diagonal + floor)
-    step = torch.linalg.solve_ex(damped, right.unsqueeze(-1)).result.squeeze(-1)
+    step = torch.linalg.solve_ex(damped, (right * unit).unsqueeze(-1)).result.squeeze(-1) * unit
     return torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
-
-
-def _choose(better: Tensor, trial: Straightness, now: Straightness) -> Straightness:
-    def pick(new: Tensor, old: Tensor) -> Tensor:
-        return torch.where(better.reshape(-1, *([1] * (new.ndim - 1))), new, old)
-
-    return Straightness(
-        residual=pick(trial.residual, now.residual),
-        lines=Lines(*(pick(new, old) for new, old in zip(trial.lines, now.lines, strict=True))),
-        corrected=pick(trial.corrected, now.corrected),
-        gradient=pick(trial.gradient, now.gradient),
-        cost=pick(trial.cost, now.cost),
-    )

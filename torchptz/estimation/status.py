@@ -12,12 +12,17 @@ from torchptz.lens import RadialLens
 
 # A centre known no better than this part of the half width is not known.
 CENTER_SIGMA_LIMIT = 0.25
+FLAT_CENTER_SIGMA = 0.05
 # l' C^-1 l per coefficient, below which L cannot be told from 1: the centre then follows the noise,
 # much farther than its linearised covariance says.
 SEEN_LIMIT = 10.0
-# A correction at the image's farthest corner known no better than this part of the half width is
-# not known.
-CORNER_SIGMA_LIMIT = 0.01
+# A lens that is known no better than this part of the half width at the picture's border is not
+# known.
+BORDER_SIGMA_LIMIT = 0.01
+# Residuals so many times those that richer powers leave are the lens', not the points'.
+MISFIT_LIMIT = 2.0
+# With fewer inliers than this share of the points, others could pass for them.
+INLIER_SHARE_LIMIT = 0.6
 
 
 class Status(Enum):
@@ -36,13 +41,19 @@ class Status(Enum):
     NOT_MONOTONIC = (
         "the estimated lens folds inside the picture: use fewer powers, or scan nearer the corners"
     )
+    OUTLIERS = (
+        "too many points lie off their lines to tell which are right: look at the pattern, and "
+        "collect it again"
+    )
+    MISFIT = "the powers cannot follow this lens: use others, or leave the choice to auto"
     NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
 
 
 def too_few(problem: Problem) -> Tensor:
     """(B,) bool: fewer degrees of freedom than unknowns, or lines in too few places."""
-    unknowns = 2 + len(problem.powers) + (problem.offsets is not None)
-    return (problem.line_count < 3) | (problem.count - 2 * problem.line_count - unknowns < 1)
+    return (problem.line_count < 3) | (
+        problem.count - 2 * problem.line_count - problem.unknowns < 1
+    )
 
 
 def center_sigma(covariance: Tensor) -> Tensor:
@@ -54,13 +65,16 @@ def center_sigma(covariance: Tensor) -> Tensor:
     return torch.where(known, largest, torch.inf)
 
 
-def center_unobservable(coefficients: Tensor, covariance: Tensor, scale: Tensor) -> Tensor:
+def center_unobservable(
+    coefficients: Tensor, covariance: Tensor, scale: Tensor, converged: Tensor
+) -> Tensor:
     """(B,) bool: the centre is known too badly, or there is no distortion to have one.
 
     Args:
         coefficients: (B, K).
         covariance: (B, M, M) with centre and coefficients free.
         scale: (B,) px.
+        converged: (B,) bool. A valley so flat that the search is lost in it has no bottom.
     """
     count = coefficients.shape[1]
     block = covariance[:, 2 : 2 + count, 2 : 2 + count]
@@ -68,27 +82,33 @@ def center_unobservable(coefficients: Tensor, covariance: Tensor, scale: Tensor)
     safe = torch.where(known[:, None, None], block, torch.eye(count).to(block))
     solved = torch.linalg.solve_ex(safe, coefficients.unsqueeze(-1)).result.squeeze(-1)
     seen = known & ((coefficients * solved).sum(-1) > SEEN_LIMIT * count)
-    return ~seen | (center_sigma(covariance) > CENTER_SIGMA_LIMIT * scale)
+    limit = torch.where(converged, CENTER_SIGMA_LIMIT, FLAT_CENTER_SIGMA) * scale
+    return ~seen | (center_sigma(covariance) > limit)
 
 
-def corner_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
-    """(B,) px, standard deviation of ``r L(r)`` at the farthest corner, for a known centre and up
-    to the size of the whole picture.
-
-    Straightness hardly fixes the size. Over a disc of radius R, the scale that fits ``r^(p+1)``
-    best (least squares over its area) is ``4 R^p / (p + 4)``; what it leaves at R is
-    ``R^(p+1) p / (p + 4)``.
-    """
-    radius = (lens.farthest_corner() / lens.scale)[:, None]
-    lever = lens.scale[:, None] * radius ** (lens.powers + 1) * lens.powers / (lens.powers + 4)
-    block = covariance[:, 2 : 2 + lens.powers.numel(), 2 : 2 + lens.powers.numel()]
-    known = block.isfinite().all((1, 2))
-    variance = torch.einsum("bi,bij,bj->b", lever, block.nan_to_num(0.0, 0.0, 0.0), lever)
-    return torch.where(known, variance.clamp_min(0).sqrt(), torch.inf)
+def border_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
+    """(B,) px, standard deviation of the corrected picture's border where it is largest, up to a
+    homography (the part that straight lines can fix) and at the scale of the picture that was
+    taken. Inf where it is not known."""
+    share = torch.tensor([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1)], dtype=torch.float64)
+    border = share.to(lens.center) * lens.image_size[:, None] - 0.5
+    sigma = lens.displacement_sigma(border, covariance, part="lines")
+    stretch = torch.linalg.vector_norm(lens.undistort(border) - lens.center[:, None], dim=-1)
+    stretch = stretch / torch.linalg.vector_norm(border - lens.center[:, None], dim=-1)
+    sigma = sigma / stretch.clamp_min(1.0)
+    # Beyond a fold there is no picture; that is another failure.
+    return torch.where(sigma.isnan(), 0.0, sigma).amax(-1)
 
 
 def judge(
-    problem: Problem, lens: RadialLens, covariance: Tensor, converged: Tensor, held: Tensor
+    problem: Problem,
+    lens: RadialLens,
+    covariance: Tensor,
+    *,
+    converged: Tensor,
+    held: Tensor,
+    outlying: Tensor,
+    misfit: Tensor,
 ) -> list[Status]:
     """Status of each item, the most basic failure first.
 
@@ -98,16 +118,24 @@ def judge(
         covariance: (B, M, M).
         converged: (B,) bool.
         held: (B,) bool, items whose centre was found unobservable and kept at its start.
+        outlying: (B,) bool, items whose points do not lie on lines.
+        misfit: (B,) bool, items that other powers would straighten much better.
 
     Returns:
         B members of Status.
     """
+    inlier_share = problem.count / problem.mask.sum((1, 2)).clamp_min(1)
     reasons = [
+        (
+            Status.OUTLIERS,
+            outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
+        ),
         (Status.TOO_FEW_LINES, too_few(problem)),
         (
             Status.DISTORTION_UNOBSERVABLE,
-            ~(corner_sigma(lens, covariance) <= CORNER_SIGMA_LIMIT * lens.scale),
+            ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),
         ),
+        (Status.MISFIT, misfit),
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
         (Status.CENTER_UNOBSERVABLE, held),

@@ -38,10 +38,11 @@ def collect_fleet(
 def calibrate(
     config: FleetConfig | str | Path,
     out: str | Path,
-    powers: Sequence[float] = (1, 2, 3),
+    powers: Sequence[float] | str = (1, 2, 3),
     progress: Progress = lambda *_: None,
+    **estimation: object,
 ) -> Summary:
-    """Calibrate a fleet: `collect_fleet`, then `solve`.
+    """Calibrate a fleet: `collect_fleet`, then `solve`, which takes ``powers`` and ``estimation``.
 
     Raises:
         ConfigError: the configuration cannot be used.
@@ -51,4 +52,5 @@ def calibrate(
         config = load_config(config)
     collect_fleet(config, out, progress)
     # The run's folder may still hold cameras of an earlier configuration.
-    return solve(out, powers, cameras=[camera.name for camera in config.cameras])
+    names = [camera.name for camera in config.cameras]
+    return solve(out, powers, cameras=names, **estimation)

@@ -19,6 +19,7 @@ from torchptz.fleet.journal import Journal
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.patterns import LinePatterns
 from torchptz.scanning.approach import Approach, approach
+from torchptz.scanning.head_errors import HeadErrors
 from torchptz.scanning.line_scan import ScannedLine, View, plan_lines, scan_pattern
 from torchptz.scanning.observation import Observation, Observer, Stopped
 from torchptz.scanning.prediction import ImagePredictor
@@ -165,6 +166,12 @@ class Collector:
         record.principal_point = pp.tolist()
         record.principal_point_covariance = covariance.tolist()
         record.ray, record.ray_sigma = ray.ray.tolist(), ray.ray_sigma
+        head_errors = HeadErrors(
+            ray.ray_sigma,
+            math.radians(config.tilt_zero_sigma_deg),
+            math.radians(config.boresight_sigma_deg),
+        )
+        record.head_errors = head_errors.by_source()
         record.feature = config.feature.model_dump()
         record.save(self._folder)
 
@@ -191,6 +198,7 @@ class Collector:
                 pixel_aspect=config.pixel_aspect,
                 zoom=zoom,
                 radius=float(radius if np.isfinite(radius) else found.radius * relative[level]),
+                head_errors=head_errors,
             )
             self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
 
@@ -317,6 +325,7 @@ class Collector:
             self._image_size,
             [[line.offsets for line in lines]],
             [[line.sigma for line in lines]],
+            [[line.systematic for line in lines]],
         )
 
     def _reason(self, error: Exception) -> str:

@@ -79,6 +79,12 @@ class CameraConfig(Section):
     pixel_aspect: float = Field(1.0, gt=0.5, lt=2, description="width over height of a pixel")
     pan_sign: Literal[1, -1] = Field(1, description="-1: the pan axis runs the other way")
     tilt_sign: Literal[1, -1] = Field(1, description="-1: the tilt axis runs the other way")
+    tilt_zero_sigma_deg: float = Field(
+        0.1, ge=0, le=10, description="how well the tilt's zero is known, degrees, one sigma"
+    )
+    boresight_sigma_deg: float = Field(
+        0.1, ge=0, le=10, description="how well the optical axis is, degrees, one sigma per axis"
+    )
     scan: ScanConfig = ScanConfig()
     timing: TimingConfig = TimingConfig()
 

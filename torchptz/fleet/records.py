@@ -63,6 +63,9 @@ class CameraRecord(_Record):
     principal_point_covariance: list[Pair] | None = Field(None, min_length=2, max_length=2)  # px^2
     ray: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None  # unit vector
     ray_sigma: float | None = Field(None, ge=0)  # rad
+    # rad, one sigma of each error of the head's geometry, in the order in which the patterns'
+    # ``systematic`` has them
+    head_errors: dict[str, Annotated[float, Field(ge=0)]] = {}
     feature: dict | None = None
     zooms: list[ZoomRecord] = []
     error: str | None = None  # why the camera failed

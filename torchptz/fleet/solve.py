@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from torchptz.estimation import Fit, Status, estimate
-from torchptz.files import without_nan, write_whole
 from torchptz.fleet.records import RECORD_NAME, CameraRecord, ZoomRecord
+from torchptz.fleet.summary import CameraResult, Summary, ZoomResult
+from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 from torchptz.zoom_table import Knot, ZoomTable
 
-SCHEMA = "torchptz.summary"
-SCHEMA_VERSION = 1
 TABLE_NAME, SUMMARY_NAME = "table.json", "summary.json"
 TABLE_NAME_WITHOUT = "table_without_offsets.json"
 SUMMARY_NAME_WITHOUT = "summary_without_offsets.json"
@@ -26,57 +24,11 @@ SUMMARY_NAME_WITHOUT = "summary_without_offsets.json"
 # long one: the lens is good, only its centre means nothing.
 _USABLE = frozenset({Status.OK, Status.CENTER_UNOBSERVABLE})
 
+# The distortion's centre lies so near the principal point, px (one sigma per axis).
+_CENTER_BESIDE = 5.0
+
 # A batch is at most so many times as large as what is in it.
 _MOST_PADDING = 3
-
-
-@dataclass(frozen=True)
-class ZoomResult:
-    """What became of one zoom of one camera."""
-
-    nominal_zoom: float | None  # magnification that was asked for
-    magnification: float  # measured, or nominal where it was not
-    zoom_units: float | None  # the device's own
-    ok: bool  # it has a lens, and collecting its lines went well
-    status: str | None  # name of the fit's status; None where there was nothing to fit
-    rms_px: float | None = None  # px in the picture, per degree of freedom
-    gain: float | None = None  # of the offsets
-    gain_sigma: float | None = None
-    center: tuple[float, float] | None = None  # px
-    lines: int = 0
-    points: int = 0
-    error: str | None = None  # why it is not ok, or what to know about it
-
-
-@dataclass(frozen=True)
-class CameraResult:
-    """What became of one camera."""
-
-    zooms: tuple[ZoomResult, ...]
-    table: str | None  # file, relative to the run; None where no zoom has a lens
-    error: str | None  # why the camera as a whole is not ok
-
-    @property
-    def ok(self) -> bool:
-        """Every zoom has a lens, and nothing else went wrong."""
-        return self.error is None and self.table is not None and all(z.ok for z in self.zooms)
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What became of a run."""
-
-    cameras: dict[str, CameraResult]
-
-    @property
-    def all_ok(self) -> bool:
-        """Every zoom of every camera has a lens."""
-        return all(camera.ok for camera in self.cameras.values())
-
-    @property
-    def none_ok(self) -> bool:
-        """No zoom of any camera has one."""
-        return all(camera.table is None for camera in self.cameras.values())
 
 
 @dataclass(frozen=True)
@@ -87,13 +39,21 @@ class _Item:
     index: int  # of the zoom in the record
     patterns: LinePatterns  # batch of one
     center: tuple[float, float]  # px, where the centre starts
+    center_covariance: torch.Tensor | None  # (2, 2) px^2; None: nothing is known beforehand
     pixel_aspect: float
+
+    @property
+    def kind(self) -> tuple[bool, bool]:
+        """Items of different kinds are not fitted together: what one lacks it would be given."""
+        return self.patterns.offsets is None, self.center_covariance is None
 
 
 def solve(
     run: str | Path,
-    powers: Sequence[float] = (1, 2, 3),
+    powers: Sequence[float] | str = (1, 2, 3),
     *,
+    method: str = "ml",
+    robust: bool = True,
     offsets: bool = True,
     cameras: Sequence[str] | None = None,
     **options: object,
@@ -102,11 +62,14 @@ def solve(
 
     Args:
         run: folder with one folder a camera, as collection leaves it.
-        powers: as for `estimate`.
+        powers, method, robust: as for `estimate`. With "ml", a principal point that was measured
+            is where the centre is expected, give or take 5 px beside what it is uncertain by: the
+            distortion has a centre of its own.
         offsets: use the known offsets of the points, where there are any. Without, the results go
-            to files of other names, so that both can be compared.
+            to files of other names, so that both can be compared, and ``robust`` is off: points
+            that a head's rounding put beside their lines are the rule, not outliers.
         cameras: names of those to solve; default all that have been collected there.
-        options: more of `estimate`'s, such as ``method``.
+        options: more of `estimate`'s.
 
     Returns:
         Summary, as written to the run's folder. A camera that failed, in collection or now, is
@@ -147,7 +110,7 @@ def solve(
                     items.append(_load_item(folder, record, index, offsets))
             except (OSError, ValueError) as error:
                 unreadable[folder.name, index] = str(error)
-    fits = _fit(items, powers, options)
+    fits = _fit(items, powers, {"method": method, "robust": robust and offsets, **options})
     results = {
         name: CameraResult((), None, record)
         if isinstance(record, str)
@@ -155,7 +118,7 @@ def solve(
         for name, record in records.items()
     }
     summary = Summary(results)
-    _save(summary, run / (SUMMARY_NAME if offsets else SUMMARY_NAME_WITHOUT))
+    summary.save(run / (SUMMARY_NAME if offsets else SUMMARY_NAME_WITHOUT))
     return summary
 
 
@@ -173,45 +136,54 @@ def _load_item(folder: Path, record: CameraRecord, index: int, offsets: bool) ->
     if not offsets:
         patterns = patterns.without_offsets()
     center = record.principal_point or [(width - 1) / 2, (height - 1) / 2]
-    return _Item(folder.name, index, patterns, (center[0], center[1]), record.pixel_aspect)
+    known = _tensor(record.principal_point and record.principal_point_covariance)
+    if known is not None:
+        known = known + _CENTER_BESIDE**2 * torch.eye(2, dtype=torch.float64)
+    return _Item(folder.name, index, patterns, (center[0], center[1]), known, record.pixel_aspect)
 
 
 def _fit(
-    items: list[_Item], powers: Sequence[float], options: dict[str, object]
+    items: list[_Item], powers: Sequence[float] | str, options: dict[str, object]
 ) -> dict[tuple[str, int], Fit]:
     """Fit of one, by camera and index of the zoom."""
     fits = {}
     for batch in _batches(items):
+        priors = [i.center_covariance for i in batch if i.center_covariance is not None]
+        if options.get("method") == "lanz":  # the paper knows none
+            priors = []
         fit = estimate(
             LinePatterns.stack([item.patterns for item in batch]),
             powers,
             center=torch.tensor([item.center for item in batch], dtype=torch.float64),
+            center_covariance=torch.stack(priors) if priors else None,
             pixel_aspect=torch.tensor([i.pixel_aspect for i in batch], dtype=torch.float64),
             **options,
         )
-        fits |= {(item.camera, item.index): fit[i] for i, item in enumerate(batch)}
+        for i, item in enumerate(batch):
+            one = fit[i]
+            if item.patterns.systematic is None:  # of a head, not of photographs beside one
+                one = replace(one, systematic_covariance=None)
+            fits[item.camera, item.index] = one
     return fits
 
 
 def _batches(items: list[_Item]) -> list[list[_Item]]:
     """Items that are fitted together: all of a fleet, as long as they are of a kind.
 
-    Those without offsets go apart, lest they get a gain that means nothing. So do patterns of very
-    different shapes, a few long lines and many short ones, that would be mostly padding together.
+    Those without offsets go apart, lest they get a gain that means nothing, and those without a
+    principal point. So do patterns of very different shapes, a few long lines and many short ones,
+    that would be mostly padding together.
     """
     batches: list[list[_Item]] = []
-    kind = None
-    for item in sorted(items, key=lambda i: (i.patterns.offsets is None, i.patterns.mask.shape[2])):
+    for item in sorted(items, key=lambda i: (i.kind, i.patterns.mask.shape[2])):
         grown = [*batches[-1], item] if batches else [item]
         shapes = [one.patterns.mask.shape[1:] for one in grown]
         padded = len(grown) * max(lines for lines, _ in shapes) * max(n for _, n in shapes)
         wasteful = padded > _MOST_PADDING * sum(lines * n for lines, n in shapes)
-        without = item.patterns.offsets is None
-        if not batches or without != kind or wasteful:
+        if not batches or item.kind != batches[-1][0].kind or wasteful:
             batches.append([item])
         else:
             batches[-1] = grown
-        kind = without
     return batches
 
 
@@ -277,6 +249,8 @@ def _zoom_result(zoom: ZoomRecord, fit: Fit) -> ZoomResult:
         ok=status in _USABLE and zoom.error is None,
         status=status.name,
         rms_px=_number(fit.rms_px),
+        sigma_px=_largest_sigma(fit.lens, fit.covariance),
+        systematic_px=_largest_sigma(fit.lens, fit.systematic_covariance),
         gain=_number(fit.gain),
         gain_sigma=_number(fit.gain_sigma),
         center=(center[0], center[1]) if all(map(math.isfinite, center)) else None,
@@ -298,6 +272,9 @@ def _knot(zoom: ZoomRecord, fit: Fit) -> Knot:
         gain=_number(fit.gain),
         gain_sigma=_number(fit.gain_sigma),
         covariance=fit.covariance[0],
+        systematic_covariance=None
+        if fit.systematic_covariance is None
+        else fit.systematic_covariance[0],
         # Not times the gain, which also tells how far the readings can be trusted.
         focal_length_px=zoom.focal_length_px,
         focal_length_sigma_px=zoom.focal_length_sigma_px,
@@ -306,16 +283,14 @@ def _knot(zoom: ZoomRecord, fit: Fit) -> Knot:
     )
 
 
-def _save(summary: Summary, path: Path) -> None:
-    stored = {
-        "schema": SCHEMA,
-        "version": SCHEMA_VERSION,
-        "all_ok": summary.all_ok,
-        "cameras": {
-            name: {"ok": camera.ok, **asdict(camera)} for name, camera in summary.cameras.items()
-        },
-    }
-    write_whole(path, json.dumps(without_nan(stored), indent=2, ensure_ascii=False) + "\n")
+def _largest_sigma(lens: RadialLens, covariance: torch.Tensor | None) -> float | None:
+    """px, over the picture and with its corners, of a batch of one."""
+    if covariance is None:
+        return None
+    width, height = lens.image_size[0] - 1
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)
+    points = torch.cartesian_prod(width * share, height * share)[None]
+    return _number(lens.displacement_sigma(points, covariance).amax(1))
 
 
 def _number(value: torch.Tensor | None) -> float | None:

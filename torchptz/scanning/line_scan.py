@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torchptz.cameras import CameraError, Capabilities, Pose
 from torchptz.geometry import line_plane, project, to_camera
 from torchptz.scanning.control import plane_distance, scan_lines
 from torchptz.scanning.grid import reachable_near
+from torchptz.scanning.head_errors import HeadErrors, displacements
 from torchptz.scanning.layout import spread_lines
 from torchptz.scanning.observation import Observation, Observer
 from torchptz.scanning.prediction import ImagePredictor
@@ -37,6 +38,7 @@ class View:
     pixel_aspect: float  # width over height of a pixel
     zoom: float  # device units
     radius: float  # px, of the feature
+    head_errors: HeadErrors = field(default_factory=HeadErrors)
 
     @property
     def margin(self) -> float:
@@ -67,6 +69,7 @@ class ScannedLine:
     points: np.ndarray  # (n, 2) px
     offsets: np.ndarray  # (n, 2) undistorted px, f_assumed (x_read - x_asked)
     sigma: np.ndarray  # (n,) px
+    systematic: np.ndarray  # (n, 2, Q) undistorted px per sigma of each of the head's errors
 
 
 def plan_lines(
@@ -210,6 +213,7 @@ def _scanned(found: list[Observation], plane: Tensor, ray: Tensor, view: View) -
         points=np.array([one.pixel for one in found]),
         offsets=(view.focal_lengths * beside).numpy(),
         sigma=np.array([one.sigma for one in found]),
+        systematic=displacements(view.head_errors, ray, pan, tilt, view.focal_lengths).numpy(),
     )
 
 

@@ -1,0 +1,224 @@
+"""What the project promises in figures, measured: numbers and time, which no test is for.
+
+`benchmark.py accuracy --json FILE` measures how accurate the estimator is, section by section (the
+modules of `accuracy`). The exit code is 0 only if every check holds: 1 if one does not or a section
+failed, 2 if the command was called wrongly, 130 if it was interrupted. What was measured until then
+is in the file.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import os
+import platform
+import sys
+import time
+import traceback
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import ModuleType
+
+import click
+import torch
+
+from torchptz.files import without_nan, write_whole
+
+SECTIONS = (
+    *("paper_experiment", "lensfun", "real_sets", "catalogue", "offsets", "outliers"),
+    "convergence",
+)
+_PACKAGES = (
+    *("torchptz", "torch", "numpy", "scipy", "opencv-python-headless", "kornia"),
+    *("lensfunpy", "discorpy", "hypothesis"),
+)
+_ROOT = Path(__file__).resolve().parents[1]
+_FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@dataclass
+class Section:
+    """A section's figures, or why there are none."""
+
+    name: str
+    title: str
+    seconds: float = 0.0
+    figures: dict | None = None
+    table: str = ""
+    checks: dict[str, bool] = field(default_factory=dict)
+    error: str | None = None
+
+    @property
+    def holds(self) -> bool:
+        """It ran, and every check holds."""
+        return self.error is None and all(self.checks.values())
+
+    def as_dict(self) -> dict:
+        """Plain data for JSON."""
+        return {
+            "title": self.title,
+            "seconds": self.seconds,
+            "holds": self.holds,
+            "error": self.error,
+            "checks": self.checks,
+            "figures": self.figures,
+        }
+
+    def as_markdown(self) -> str:
+        """Heading, table and checks."""
+        parts = [f"## {self.title}", "", f"{self.seconds:.0f} s", ""]
+        if self.error is not None:
+            parts += [f"**Failed**: {self.error}", ""]
+        if self.table:
+            parts += [self.table, ""]
+        if self.checks:
+            parts += ["| check | holds |", "|---|---|"]
+            parts += [f"| {name} | {_yes(ok)} |" for name, ok in self.checks.items()]
+            parts.append("")
+        return "\n".join(parts)
+
+
+@click.group(help=__doc__.split("\n")[0])
+def main() -> None:
+    pass
+
+
+@main.command()
+@click.option("--json", "json_path", type=_FILE, required=True, help="File for all figures.")
+@click.option("--markdown", type=_FILE, help="File for the tables.")
+@click.option("--quick", is_flag=True, help="Few seeds and items: a smoke test.")
+@click.option(
+    "--only",
+    type=click.Choice(SECTIONS),
+    multiple=True,
+    metavar="SECTION",
+    help=f"Run this section only; can be repeated. There are: {', '.join(SECTIONS)}.",
+)
+@click.option("--device", default="cpu", show_default=True, help="Where sections that can compute.")
+def accuracy(
+    json_path: Path, markdown: Path | None, quick: bool, only: tuple[str, ...], device: str
+) -> None:
+    """Measure how accurate the estimator is, and check what it promises."""
+    started = time.perf_counter()
+    asked = [name for name in SECTIONS if not only or name in only]
+    report: dict = {
+        "command": "accuracy",
+        "quick": quick,
+        "environment": environment(),
+        "sections_asked": asked,
+    }
+    done: list[Section] = []
+    try:
+        for name in asked:
+            click.echo(f"{name} ...")
+            done.append(run_section(name, quick, device))
+            _write(report, done, started, json_path, markdown)
+            _print(done[-1])
+    except KeyboardInterrupt:
+        click.echo(f"interrupted; what was measured is in {json_path}", err=True)
+        sys.exit(130)
+    failed = [f"{one.name}: {text}" for one in done for text in _failures(one)]
+    held = sum(sum(one.checks.values()) for one in done)
+    click.echo(f"{held} checks hold, {len(failed)} do not; figures in {json_path}")
+    for text in failed:
+        click.echo(f"  {text}")
+    sys.exit(1 if failed else 0)
+
+
+def run_section(name: str, quick: bool, device: str = "cpu") -> Section:
+    """Run one section; whatever it raises becomes its error.
+
+    Args:
+        name: a module of `accuracy`.
+        quick: few seeds and items.
+        device: for a section whose `run` takes one; the others compute where they always do.
+    """
+    section = Section(name, name)
+    started = time.perf_counter()
+    try:
+        module = _load(name)
+        section.title = module.TITLE
+        where = {"device": device} if "device" in inspect.signature(module.run).parameters else {}
+        figures = module.run(quick, **where)
+        # What JSON cannot hold is this section's failure, not that of the file.
+        section.figures = json.loads(json.dumps(without_nan(figures), allow_nan=False))
+        section.table = module.table(figures)
+        section.checks = {text: bool(ok) for text, ok in module.checks(figures).items()}
+    except Exception as error:  # one section must not lose the others' figures
+        # Where in the sources it happened, without the folders of this machine.
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        message = " ".join(str(error).replace(f"{_ROOT}{os.sep}", "").split())
+        section.error = f"{type(error).__name__}: {message} ({Path(last.filename).name})"
+        traceback.print_exc()
+    section.seconds = time.perf_counter() - started
+    return section
+
+
+def environment() -> dict:
+    """Versions and kind of machine, neither its name nor its folders."""
+    return {
+        "python": platform.python_version(),
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "cpus": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _load(name: str) -> ModuleType:
+    return importlib.import_module(f"accuracy.{name}")
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _write(
+    report: dict, done: list[Section], started: float, path: Path, markdown: Path | None
+) -> None:
+    report["seconds"] = time.perf_counter() - started
+    complete = len(done) == len(report["sections_asked"])
+    report["all_hold"] = complete and all(one.holds for one in done)
+    report["sections"] = {one.name: one.as_dict() for one in done}
+    write_whole(path, json.dumps(without_nan(report), indent=2, allow_nan=False) + "\n")
+    if markdown is not None:
+        quick = " (quick)" if report["quick"] else ""
+        versions = ", ".join(f"{k} {v}" for k, v in report["environment"]["versions"].items() if v)
+        environment = report["environment"]
+        heading = (
+            f"# Accuracy{quick}\n\n{environment['system']} {environment['machine']}, "
+            f"{environment['cpus']} CPUs, {environment['threads']} threads; "
+            f"Python {environment['python']}, {versions}\n\n"
+        )
+        write_whole(markdown, heading + "\n".join(one.as_markdown() for one in done))
+
+
+def _print(section: Section) -> None:
+    click.echo(f"\n{section.title} ({section.seconds:.1f} s)\n")
+    if section.table:
+        click.echo(section.table + "\n")
+    for text, ok in section.checks.items():
+        click.echo(f"  {_yes(ok):3} {text}")
+    if section.error is not None:
+        click.echo(f"  failed: {section.error}")
+    click.echo()
+
+
+def _failures(section: Section) -> list[str]:
+    broken = [] if section.error is None else [section.error]
+    return broken + [text for text, ok in section.checks.items() if not ok]
+
+
+def _yes(ok: bool) -> str:
+    return "yes" if ok else "NO"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,266 @@
+"""Outlying points and lines: found before they bend the lens, set aside, reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchptz.batch import Batched
+from torchptz.estimation.arcs import (
+    FINEST,
+    NORMAL_MEDIAN,
+    between,
+    masked_median,
+    neighbour_noise,
+    on_arcs,
+)
+from torchptz.estimation.maximum_likelihood import start_from_loop
+from torchptz.estimation.problem import Problem
+from torchptz.estimation.refinement import refine
+from torchptz.estimation.residuals import State, straightness
+
+# Standard deviations beyond which a point is none of its line's: of 500 good points one in 300
+# patterns loses one.
+CUT = 4.5
+
+_RICH = (1.0, 2.0, 3.0, 4.0, 5.0)
+_FAR_STARTS, _FAR = 6, 0.7  # centres so many units of r away
+_FAR_PENALTY = 4.0  # on their mean square: with a centre far off, few lines are easily straightened
+_SUBSETS = 20  # of the lines tried as a start
+_SUBSET_SHARE = 0.4
+_TRUSTED_SHARE = 0.6  # of the lines, the straightest, that judge a start
+_LOOP_STEPS, _START_STEPS = 2, 5
+_REWEIGHTINGS, _WEIGHTED_STEPS = 12, 2
+_BIWEIGHT = 4.685  # Tukey's, 95 % efficient
+_ROUNDS = 6
+_MOST_INLIERS = 0.7  # a fit that gives up more of the points than this leaves is not believed
+_FEWEST_POINTS = 3
+_TELLING_POINTS, _TELLING_LINES = 5, 6  # fewer say nothing of how lines differ
+_EXCESS = 3.0  # standard deviations
+_RIDDEN = 5.0
+_MISFIT = 3.0  # residuals so many times the noise between neighbours are not noise
+
+
+def suspicious(problem: Problem, residual: Tensor, freedom: Tensor) -> Tensor:
+    """(B,) bool: residuals that white noise alone would hardly leave.
+
+    Gross errors can bend a fit so far that nothing looks out of place any more; then the residuals
+    are much larger than the noise between neighbours on a line.
+
+    Args:
+        problem: B items.
+        residual: (B, L, P) px, of the best fit to all points.
+        freedom: (B,) degrees of freedom.
+    """
+    whitened = residual * problem.weight.sqrt()
+    sigma = _sigma(whitened, problem.weight > 0, freedom)
+    sigma = torch.maximum(sigma, FINEST * problem.scale)
+    noise = torch.maximum(neighbour_noise(problem), FINEST * problem.scale)
+    within = (whitened.abs().amax((1, 2)) <= CUT * sigma) & (sigma <= _MISFIT * noise)
+    return ~within | bad_lines(problem.weight > 0, whitened, sigma[:, None]).any(-1)
+
+
+def bad_lines(used: Tensor, whitened: Tensor, sigma: Tensor) -> Tensor:
+    """(B, L) bool: lines whose points as a whole are farther off than noise would have it.
+
+    Args:
+        used: (B, L, P) bool.
+        whitened: (B, L, P) px, residuals.
+        sigma: (B, L) or (B, 1) px, noise.
+
+    Source: Wilson and Hilferty's approximation of the chi-squared quantile.
+    """
+    freedom = (used.sum(-1) - 2).clamp_min(1)
+    spread = (2 / (9 * freedom)).sqrt()
+    bound = freedom * (1 - spread**2 + CUT * spread) ** 3
+    squares = torch.where(used, whitened, 0.0).square().sum(-1)
+    return squares > bound * sigma**2
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers(Batched):
+    """What belongs to its lines, as far as any lens can tell."""
+
+    mask: Tensor  # (B, L, P) bool
+    center: Tensor  # (B, 2) px, of the lens that went with it, to start from
+    rms: Tensor  # (B,) px, that it left
+    doubtful: Tensor  # (B,) bool: even so, the points do not lie on lines
+
+
+def find_inliers(problem: Problem, center: Tensor) -> Inliers:
+    """Points that belong to their lines.
+
+    A redescending loss forgets what is far off, but only if it starts near the truth. So each line
+    is first freed of gross errors by itself (`on_arcs`), and the lens is estimated from what is
+    left; where that does not fit, it is estimated from several subsets of the lines, and the one
+    under which most lines are straight is the start. Tukey's biweight, its scale estimated per
+    item, takes it from there; what lies beyond the cut in the end is set aside, and so are lines
+    that are bad as a whole. All that with powers enough to follow any lens: what is an outlier
+    must not depend on the powers that are asked for.
+
+    Args:
+        problem: B items.
+        center: (B, 2) px, where the centre starts.
+
+    Returns:
+        Inliers.
+
+    Source: Huber and Ronchetti, Robust Statistics; Rousseeuw and Leroy (least median of squares).
+    """
+    problem = problem.with_powers(_RICH)
+    started = on_arcs(problem)
+    cleaned = problem.using(started)
+    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=center.device)
+    state = start_from_loop(cleaned, center, free, _LOOP_STEPS)
+    state = refine(cleaned, state, free, max_steps=_START_STEPS).state
+    inliers, found = _settle(problem, state, started)
+    # Whole bad lines are left, and may have spoilt the start.
+    rows = _still_suspicious(problem, inliers, found).nonzero()[:, 0]
+    if len(rows):
+        part, begun = problem[rows], started[rows]
+        theta, trusted = _best_start(part.using(begun), center[rows])
+        state = State.from_parameters(part.using(begun), theta)
+        again = _settle(part, state, begun & trusted.unsqueeze(-1))
+        inliers, found = inliers.index_copy(0, rows, again[0]), found.with_items(rows, again[1])
+    chosen = problem.using(inliers)
+    residual = straightness(chosen, found) * chosen.weight.sqrt()
+    freedom = chosen.count - 2 * chosen.line_count - problem.unknowns
+    variance = torch.where(inliers, residual, 0.0).square().sum((1, 2)) / freedom.clamp_min(1)
+    noise = torch.maximum(neighbour_noise(chosen), FINEST * problem.scale)
+    rms = variance.sqrt()
+    return Inliers(inliers, found.theta[:, :2], rms, rms > _RIDDEN * noise)
+
+
+def _still_suspicious(problem: Problem, inliers: Tensor, state: State) -> Tensor:
+    """(B,) bool, of the fit to the inliers."""
+    chosen = problem.using(inliers)
+    few = inliers.sum((1, 2)) < _MOST_INLIERS * (problem.weight > 0).sum((1, 2))
+    freedom = chosen.count - 2 * chosen.line_count - problem.unknowns
+    return few | suspicious(chosen, straightness(chosen, state), freedom)
+
+
+def _settle(problem: Problem, state: State, started: Tensor) -> tuple[Tensor, State]:
+    """Inliers (B, L, P) from a robust start, by reweighting, then the cut until nothing changes;
+    and the fit to them."""
+    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=started.device)
+    state = _redescend(problem, state, started)
+    inliers = _within(problem, state, started)
+    for _ in range(_ROUNDS):
+        state = refine(problem.using(inliers), state, free).state
+        following = _within(problem, state, inliers)
+        if torch.equal(following, inliers):
+            break
+        inliers = following
+    return inliers, state
+
+
+def _best_start(problem: Problem, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Parameters (B, M) under which most lines are straight, and those lines (B, L) bool."""
+    batch, lines = problem.weight.shape[:2]
+    present = (problem.weight > 0).any(-1)
+    # Few lenses have their centre far from where it is looked for, but a search from there may
+    # never find it.
+    turn = torch.arange(_FAR_STARTS, device=center.device) * (2 * torch.pi / _FAR_STARTS)
+    away = torch.stack([turn.cos(), turn.sin()], -1).to(center)[:, None]
+    far = center + _FAR * problem.scale[:, None] * away
+    subsets = torch.cat([_subsets(present), present.expand(_FAR_STARTS, -1, -1)])  # (H, B, L)
+    many = subsets.shape[0]
+    centers = torch.cat([center.expand(many - _FAR_STARTS, -1, -1), far]).flatten(0, 1)
+    rows = torch.arange(batch, device=center.device).repeat(many)
+    copies = problem[rows]
+    chosen = copies.using(
+        subsets.reshape(many * batch, lines, 1).expand(-1, -1, copies.weight.shape[2])
+    )
+    free = torch.ones(many * batch, problem.unknowns, dtype=torch.bool, device=center.device)
+    state = start_from_loop(chosen, centers, free, _LOOP_STEPS)
+    state = refine(chosen, state, free, max_steps=_START_STEPS).state
+    judged = State.from_parameters(copies, state.theta)
+    whitened = straightness(copies, judged) * copies.weight.sqrt()
+    points = (copies.weight > 0).sum(-1)
+    mean = whitened.where(copies.weight > 0, 0.0).square().sum(-1) / (points - 2).clamp_min(1)
+    mean = torch.where(points > 2, mean, torch.inf).nan_to_num(torch.inf, torch.inf)
+    kept = (_TRUSTED_SHARE * (points > 2).sum(-1)).ceil().long().clamp_min(1)
+    ordered = mean.sort(-1).values
+    in_it = torch.arange(lines, device=center.device) < kept[:, None]
+    score = torch.where(in_it, ordered, 0.0).sum(-1).reshape(many, batch)
+    score[-_FAR_STARTS:] *= _FAR_PENALTY
+    best = score.nan_to_num(torch.inf).argmin(0)
+    item = torch.arange(batch, device=center.device)
+    rank = mean.argsort(-1).argsort(-1).reshape(many, batch, lines)[best, item]
+    return state.theta.reshape(many, batch, -1)[best, item], rank < kept[:batch, None]
+
+
+def _subsets(present: Tensor) -> Tensor:
+    """(H, B, L) bool: all lines, then halves of them, the same for an item wherever it stands."""
+    _, lines = present.shape
+    line = torch.arange(lines, device=present.device, dtype=torch.float64)
+    number = torch.arange(1, _SUBSETS + 1, device=present.device, dtype=torch.float64)
+    draw = ((line + 1) * (number[:, None] * 0.754877666 + 0.569840291)).sin() * 43758.5453 % 1
+    draw = torch.where(present, draw[:, None], torch.inf)
+    size = (_SUBSET_SHARE * present.sum(-1)).ceil().long().clamp_min(3)
+    rank = draw.argsort(-1).argsort(-1)
+    return torch.cat([present[None], present & (rank < size[:, None])])
+
+
+def _redescend(problem: Problem, state: State, started: Tensor) -> State:
+    """Tukey's biweight from a robust start: reweighted joint steps."""
+    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=started.device)
+    used = problem.weight > 0
+    root = problem.weight.sqrt()
+    weighed = started
+    for _ in range(_REWEIGHTINGS):
+        whitened = straightness(problem, state) * root
+        sigma = _sigma(whitened, weighed, weighed.sum((1, 2)))
+        sigma = torch.maximum(sigma, FINEST * problem.scale)
+        scale = _line_sigma(whitened, weighed, sigma).unsqueeze(-1)
+        share = (whitened / (_BIWEIGHT * scale)).clamp(-1, 1)
+        loss = (1 - share**2) ** 2
+        weighed = used & (loss > 0)
+        weighted = replace(problem, weight=problem.weight * loss)
+        state = refine(weighted, state, free, max_steps=_WEIGHTED_STEPS).state
+    return state
+
+
+def _within(problem: Problem, state: State, inliers: Tensor) -> Tensor:
+    """(B, L, P) bool: points within the cut of their lines, bad lines left out."""
+    used = problem.weight > 0
+    whitened = straightness(problem, state) * problem.weight.sqrt()
+    freedom = inliers.sum((1, 2)) - 2 * inliers.any(-1).sum(-1) - problem.unknowns
+    sigma = _sigma(whitened, inliers, freedom)
+    sigma = torch.maximum(sigma, FINEST * problem.scale)
+    scale = _line_sigma(whitened, inliers, sigma)
+    near = used & (whitened.abs() <= CUT * scale.unsqueeze(-1))
+    bad = bad_lines(near, whitened, scale)
+    few = near.sum(-1) < ((used.sum(-1) + 1) // 2).clamp_min(_FEWEST_POINTS)
+    return near & ~(bad | few).unsqueeze(-1)
+
+
+def _line_sigma(whitened: Tensor, used: Tensor, sigma: Tensor) -> Tensor:
+    """(B, L) px, noise of each line: at least the item's, at most what its other lines have too.
+
+    Real lines are not all alike: strings sag, boards bend, lenses do not quite follow the model. A
+    line is not wrong for being two times as rough as the next, where others are as well.
+    """
+    count = used.sum(-1)
+    freedom = (count - 2).clamp_min(1)
+    median = masked_median(whitened.abs(), used) / NORMAL_MEDIAN
+    own = median * (count / freedom).sqrt()
+    told = (count >= _TELLING_POINTS) & (own > 0)
+    level = torch.where(told, own, 1.0).log()
+    away = (level - masked_median(level, told)[:, None]).abs()
+    spread = masked_median(away, told) / NORMAL_MEDIAN
+    # What a median of so many points scatters by itself.
+    chance = masked_median(1.35 / freedom, told)
+    excess = (spread**2 - chance).clamp_min(0).sqrt()
+    excess = torch.where(told.sum(-1) >= _TELLING_LINES, excess, 0.0)
+    highest = sigma * (_EXCESS * excess).exp()
+    return between(own, sigma[:, None], highest[:, None])
+
+
+def _sigma(whitened: Tensor, used: Tensor, freedom: Tensor) -> Tensor:
+    """(B,) px, robust standard deviation: median of |residual|, for the degrees of freedom."""
+    count = used.sum((1, 2))
+    median = masked_median(whitened.abs().flatten(1), used.flatten(1))
+    return median / NORMAL_MEDIAN * (count / freedom.clamp_min(1)).sqrt()
