@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import ClassVar, Self
 
@@ -58,6 +59,25 @@ class Batched:
                 changed[field.name] = value.clone()
                 changed[field.name][index] = new
         return replace(self, **changed)
+
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """One batch of several of the same shapes, in their order."""
+        if len(parts) == 1:
+            return parts[0]
+        first = parts[0]
+        joined = {}
+        for field in fields(first):
+            values = [getattr(part, field.name) for part in parts]
+            if field.name in first._shared or values[0] is None:
+                continue
+            if isinstance(values[0], Batched):
+                joined[field.name] = type(values[0]).cat(values)
+            elif isinstance(values[0], list):
+                joined[field.name] = [one for value in values for one in value]
+            else:
+                joined[field.name] = torch.cat(values)
+        return replace(first, **joined)
 
     def to(self, device: torch.device | str) -> Self:
         """The same batch with all tensors on ``device``."""

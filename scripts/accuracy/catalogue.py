@@ -24,7 +24,7 @@ SIGMAS = 5.0  # an item that is OK is within so many of its own
 ALIKE_PX = 1e-9  # alone and in the batch
 _EXACT_PX = 1e-6  # what an error may be where the points are exact, in pictures of 640 px
 _LEAST_SIGMA = 0.1  # of the largest one over the picture
-_KEPT, _CAUGHT = 0.95, 0.99  # shares of right and wrong points
+_KEPT, _CAUGHT = 0.9, 0.99  # shares of right and wrong points: a good line may go with the bad
 # Statuses whose lens is said to be right, as far as its covariance goes.
 _KNOWN = (Status.OK, Status.CENTER_UNOBSERVABLE)
 

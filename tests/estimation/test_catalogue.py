@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from torchptz.estimation import Status
+
 SCRIPTS = str(Path(__file__).resolve().parents[2] / "scripts")
 sys.path.insert(0, SCRIPTS)  # as if a script of that folder ran
 try:
@@ -16,7 +18,6 @@ try:
     from accuracy.hostile_items import fisheye, picture_grid, polynomial
 finally:
     sys.path.remove(SCRIPTS)
-
 
 # Figures of an item as it should be.
 GOOD = {
@@ -46,36 +47,44 @@ def kinds(result):
     return {kind["name"]: kind["runs"][0] for kind in result["kinds"]}
 
 
-@pytest.mark.parametrize("name", catalogue.CASES)
+def kinds_that_may_be(*statuses):
+    """Names of the kinds for which one of the statuses is right."""
+    return [one.name for one in catalogue.CASES.values() if set(statuses) & set(one.statuses)]
+
+
 class TestKind:
+    @pytest.mark.parametrize("name", catalogue.CASES)
     def test_gets_a_status_that_it_deserves(self, kinds, name):
         deserved = [status.name for status in catalogue.CASES[name].statuses]
         assert kinds[name]["status"] in deserved, catalogue.CASES[name].why
 
+    @pytest.mark.parametrize("name", catalogue.CASES)
     def test_is_told_the_same_alone(self, kinds, name):
         assert kinds[name]["status"] == kinds[name]["status_alone"]
 
+    @pytest.mark.parametrize("name", kinds_that_may_be(Status.OK, Status.CENTER_UNOBSERVABLE))
     def test_is_as_wrong_as_it_says_at_most(self, kinds, name):
         one = kinds[name]
         if one["status"] not in {"OK", "CENTER_UNOBSERVABLE"}:
-            pytest.skip("no lens is claimed")
-        if one["representation_px"] is not None:
-            assert one["sigmas"] <= catalogue.SIGMAS
+            pytest.skip(f"no lens is claimed: {one['status']}")
+        assert one["sigmas"] <= catalogue.SIGMAS
 
+    @pytest.mark.parametrize("name", kinds_that_may_be(Status.OK))
     def test_is_what_it_is_alone_if_it_is_ok(self, kinds, name):
         one = kinds[name]
         if one["status"] != "OK":
-            pytest.skip("no lens is claimed")
+            pytest.skip(f"no lens is claimed: {one['status']}")
         assert one["finite"]
         assert one["center_apart_px"] <= catalogue.ALIKE_PX
         assert one["undistorted_apart_px"] <= catalogue.ALIKE_PX
 
-    def test_has_its_wrong_points_set_aside_and_no_others(self, kinds, name):
+    @pytest.mark.parametrize("name", kinds_that_may_be(Status.OK))
+    def test_has_its_wrong_points_set_aside_and_hardly_others(self, kinds, name):
         one = kinds[name]
         if one["status"] != "OK":
-            pytest.skip("no lens is claimed")
+            pytest.skip(f"no lens is claimed: {one['status']}")
         assert one["caught"] is None or one["caught"] >= 0.99
-        assert one["kept"] >= 0.95
+        assert one["kept"] >= 0.9
 
 
 class TestSection:
@@ -99,7 +108,7 @@ class TestSection:
             ("undistorted_apart_px", None),
             ("finite", False),
             ("caught", 0.9),
-            ("kept", 0.9),
+            ("kept", 0.8),
         ],
     )
     def test_a_promise_that_is_broken_is_told(self, figure, value):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,15 +10,16 @@ from torch import Tensor
 
 from torchptz.batch import Batched
 from torchptz.estimation.fixed_point import iterate
+from torchptz.estimation.implicit import differentiable
 from torchptz.estimation.maximum_likelihood import maximise
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined, refine, settle_lines
 from torchptz.estimation.residuals import State, split, straightness
-from torchptz.estimation.robust import find_inliers, suspicious
-from torchptz.estimation.status import MISFIT_LIMIT, Status, center_unobservable, judge
+from torchptz.estimation.selection import UNION, solve_with_best_powers
+from torchptz.estimation.solution import Search, Solution, solve, solve_robustly
+from torchptz.estimation.status import Status, judge
 from torchptz.estimation.uncertainty import (
-    Uncertainty,
-    from_residuals,
+    rms_of,
     systematic_covariance,
     with_center_held,
     with_prior,
@@ -31,10 +32,7 @@ METHODS = ("ml", "lanz")
 # What is assumed of a centre that neither lines nor a prior tell: near the middle of the picture,
 # give or take so much of its width.
 _VAGUE_CENTER = 0.1
-# The gain of the known offsets is 1 up to how well the focal length was assumed, and to what the
-# head's readings are worth. Where poses leave the offsets next to no variation, as at the long end,
-# a free gain runs away and takes the lens along.
-_GAIN_SIGMA = 0.3
+_CHUNK = 2**20  # points solved at a time, padding counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,7 @@ class Fit(Batched):
 
 def estimate(
     patterns: LinePatterns,
-    powers: Sequence[float] = (1, 2, 3),
+    powers: Sequence[float] | str = (1, 2, 3),
     method: str = "ml",
     robust: bool = True,
     *,
@@ -74,7 +72,8 @@ def estimate(
 
     Args:
         patterns: B patterns.
-        powers: K positive, increasing powers of r in L.
+        powers: K positive, increasing powers of r in L; or "auto" ("ml" only), which chooses for
+            each item those that predict lines best which they have not seen.
         method: "ml" minimises the straightness in distorted pixels over centre, coefficients, gain
             and lines together, which is most likely under white noise in the picture. "lanz" is the
             paper's two-step fixed point on the straightness in undistorted pixels; where the
@@ -92,103 +91,56 @@ def estimate(
 
     Returns:
         Fit. Items are independent: a bad one gets its own status and changes no other's numbers.
+        Where points or offsets require gradients, lens, gain, residuals and rms carry them, by the
+        implicit function theorem at the optimum, for the inliers and powers as found.
 
     Raises:
-        ValueError: unknown method, powers that are not positive and increasing.
+        ValueError: unknown method, powers that are neither positive and increasing nor "auto".
 
     Source: paper, section 2; "ml" and offsets: README, "Beyond the paper".
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
-    problem = Problem.from_patterns(patterns, checked_powers(powers), pixel_aspect, gain_per_axis)
-    start = problem.middle if center is None else center.to(problem.points)
-    start = start.expand_as(problem.image_size)
-    prior = _prior(problem, start, center_covariance)
+    choose = isinstance(powers, str)
+    if choose and (powers != "auto" or method != "ml"):
+        raise ValueError(f'powers are numbers, or "auto" with method "ml", not {powers!r}')
+    exponents = checked_powers(UNION if choose else powers)
 
-    def solve(items: Problem, start: Tensor, free: Tensor, prior: Prior | None) -> Refined:
+    def solver(items: Problem, start: Tensor, free: Tensor, prior: Prior | None) -> Refined:
         if method == "ml":
             return maximise(items, start, free, prior)
-        return _loop(items, start, free, free_l0, max_iterations, variance_threshold)
+        return _loop(items, start, free, prior, free_l0, max_iterations, variance_threshold)
 
-    found = _solve(problem, start, start, prior, solve)
-    outlying, misfit = torch.zeros_like(found.held), torch.zeros_like(found.held)
-    if method == "ml" and robust:
-        freedom = problem.count - 2 * problem.line_count - problem.unknowns
-        residual = straightness(problem, found.solution.state)
-        rows = suspicious(problem, residual, freedom).nonzero()[:, 0]
-        if len(rows):
-            freed = problem[rows]
-            inliers = find_inliers(freed, start[rows])
-            freed = freed.using(inliers.mask)
-            # Where the inliers were found, or where the lens was looked for, whichever is better.
-            tries = [
-                _solve(freed, begin, start[rows], prior and prior[rows], solve)
-                for begin in (start[rows], inliers.center)
-            ]
-            again = tries[0].where(~(tries[1].known.rms < tries[0].known.rms), tries[1])
-            problem, found = problem.with_items(rows, freed), found.with_items(rows, again)
-            outlying[rows] = inliers.doubtful
-            misfit[rows] = again.known.rms > MISFIT_LIMIT * inliers.rms
-    return _as_fit(problem, patterns, found, prior, center_covariance, outlying, misfit)
+    def fit(patterns: LinePatterns, aspect: Tensor, search: Search) -> Fit:
+        problem = Problem.from_patterns(patterns, exponents, aspect, gain_per_axis)
+        with torch.no_grad():
+            if choose:
+                used, solution = solve_with_best_powers(problem, search, solver, robust)
+            elif method == "ml" and robust:
+                used, solution = solve_robustly(problem, search, solver)
+            else:
+                used, solution = problem, solve(problem, search, solver)
+        return _as_fit(used, patterns, search, solution)
 
-
-def _prior(problem: Problem, center: Tensor, center_covariance: Tensor | None) -> Prior | None:
-    """Of the centre where one is given, of the gains where there are any."""
-    gains = problem.unknowns - 2 - len(problem.powers)
-    if center_covariance is None and gains == 0:
-        return None
-    information = center.new_zeros(len(center), problem.unknowns, problem.unknowns)
-    mean = center.new_zeros(len(center), problem.unknowns)
-    if center_covariance is not None:
-        mean[:, :2] = center
-        information[:, :2, :2] = torch.linalg.inv(center_covariance.to(center))
-    for i in range(problem.unknowns - gains, problem.unknowns):
-        mean[:, i] = 1
-        information[:, i, i] = 1 / _GAIN_SIGMA**2
-    return Prior(mean, information)
-
-
-@dataclass(frozen=True, eq=False)
-class _Found(Batched):
-    solution: Refined
-    known: Uncertainty
-    free: Tensor  # (B, M) bool
-
-    @property
-    def held(self) -> Tensor:
-        """(B,) bool, items whose centre is not observable and was kept where it was."""
-        return ~self.free[:, 0]
-
-
-def _solve(
-    problem: Problem,
-    start: Tensor,
-    home: Tensor,
-    prior: Prior | None,
-    solve: Callable[..., Refined],
-) -> _Found:
-    """With every centre free from ``start``; held at ``home`` where it is not observable."""
-    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=start.device)
-    solution = solve(problem, start, free, prior)
-    found = _Found(solution, from_residuals(problem, solution.state, free), free)
-    # Next to no distortion leaves the centre undetermined, and it would drag L along.
-    coefficients = solution.state.theta[:, 2 : 2 + len(problem.powers)]
-    hold = center_unobservable(
-        coefficients, found.known.covariance, problem.scale, solution.converged
-    )
-    rows = hold.nonzero()[:, 0]
-    if len(rows) == 0:
-        return found
-    free, items = free[rows].clone(), problem[rows]
-    free[:, :2] = False
-    again = solve(items, home[rows], free, prior and prior[rows])
-    return found.with_items(rows, _Found(again, from_residuals(items, again.state, free), free))
+    size = patterns.image_size.double()
+    start = ((size - 1) / 2 if center is None else center.to(size)).expand_as(size)
+    if center_covariance is not None and method == "ml":
+        center_covariance = center_covariance.to(size).expand(len(size), 2, 2)
+    else:
+        center_covariance = None
+    search = Search(start, start, center_covariance)
+    aspect = torch.as_tensor(pixel_aspect, dtype=size.dtype, device=size.device).expand(len(size))
+    # Not all at once: what does not fit the caches is slow, and what does not fit the memory fails.
+    step = max(1, _CHUNK // max(1, patterns.mask[0].numel()))
+    parts = [slice(begun, begun + step) for begun in range(0, len(patterns), step)]
+    return Fit.cat([fit(patterns[part], aspect[part], search[part]) for part in parts])
 
 
 def _loop(
     problem: Problem,
     start: Tensor,
     free: Tensor,
+    prior: Prior | None,
     free_l0: bool,
     max_iterations: int,
     variance_threshold: float | None,
@@ -209,21 +161,33 @@ def _loop(
     state = State.from_parameters(problem, theta)
     if gain is None:
         return Refined(settle_lines(problem, state), loop.iterations, loop.converged)
-    refined = refine(problem, state, free)
+    refined = refine(problem, state, free, prior)
     return Refined(refined.state, loop.iterations + refined.iterations, refined.converged)
 
 
-def _as_fit(
-    problem: Problem,
-    patterns: LinePatterns,
-    found: _Found,
-    prior: Prior | None,
-    center_covariance: Tensor | None,
-    outlying: Tensor,
-    misfit: Tensor,
-) -> Fit:
-    solution, known, free = found.solution, found.known, found.free
-    center, coefficients, gain = split(problem, solution.state.theta)
+def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: Solution) -> Fit:
+    state, known, free = solution.refined.state, solution.known, solution.free
+    with torch.no_grad():
+        covariance = known.covariance
+        prior = search.prior(problem)
+        if prior is not None:
+            covariance = with_prior(known, free, prior)
+        assumed = search.covariance
+        if assumed is None:
+            identity = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+            assumed = (_VAGUE_CENTER * problem.image_size[:, :1, None]) ** 2 * identity
+        held = with_center_held(known, covariance, assumed)
+        covariance = torch.where(solution.held[:, None, None], held, covariance)
+        systematic = None
+        if patterns.systematic is not None:
+            systematic = systematic_covariance(problem, state, free, patterns.systematic.double())
+    rms = known.rms
+    if problem.points.requires_grad or (
+        problem.offsets is not None and problem.offsets.requires_grad
+    ):
+        state = differentiable(problem, state, free, prior)
+        rms = rms_of(problem, state, free)
+    center, coefficients, gain = split(problem, state.theta)
     lens = RadialLens(
         center,
         coefficients,
@@ -232,42 +196,33 @@ def _as_fit(
         problem.image_size,
         problem.pixel_aspect,
     )
-    covariance = known.covariance
-    if prior is not None:
-        covariance = with_prior(known, free, prior)
-    if center_covariance is None:
-        vague = (_VAGUE_CENTER * problem.image_size[:, 0]).square()[:, None, None]
-        center_covariance = vague * torch.eye(2, dtype=center.dtype, device=center.device)
-    held = with_center_held(known, covariance, center_covariance.to(center))
-    covariance = torch.where(found.held[:, None, None], held, covariance)
-    systematic = None
     size = 2 + len(problem.powers)
-    displacements = getattr(patterns, "systematic", None)
-    if displacements is not None:
-        systematic = systematic_covariance(problem, solution.state, free, displacements.double())
-        systematic = systematic[:, :size, :size]
     gain_sigma = None
     if gain is not None:
         gain_sigma = covariance[:, size:, size:].diagonal(dim1=1, dim2=2).sqrt()
         if not problem.gain_per_axis:
             gain, gain_sigma = gain[:, 0], gain_sigma[:, 0]
-    return Fit(
-        lens=lens,
-        rms_px=known.rms,
-        residuals=straightness(problem, solution.state),
-        inliers=problem.weight > 0,
-        iterations=solution.iterations,
-        covariance=covariance[:, :size, :size],
-        systematic_covariance=systematic,
-        gain=gain,
-        gain_sigma=gain_sigma,
-        status=judge(
+    covariance = covariance[:, :size, :size]
+    with torch.no_grad():
+        status = judge(
             problem,
             lens,
-            covariance[:, :size, :size],
-            converged=solution.converged,
-            held=found.held,
-            outlying=outlying,
-            misfit=misfit,
-        ),
+            covariance,
+            unknowns=free.sum(-1) + 2 * solution.held,
+            converged=solution.refined.converged,
+            held=solution.held,
+            outlying=solution.outlying,
+            misfit=solution.misfit,
+        )
+    return Fit(
+        lens=lens,
+        rms_px=rms,
+        residuals=straightness(problem, state),
+        inliers=problem.weight > 0,
+        iterations=solution.refined.iterations,
+        covariance=covariance,
+        systematic_covariance=None if systematic is None else systematic[:, :size, :size],
+        gain=gain,
+        gain_sigma=gain_sigma,
+        status=status,
     )

@@ -89,6 +89,10 @@ class Problem(Batched):
             self, powers=self.powers.new_tensor(powers), exponents=tuple(map(float, powers))
         )
 
+    def with_data(self, points: Tensor, offsets: Tensor | None) -> Problem:
+        """The same problem with other points (B, L, P, 2) and offsets alike, px."""
+        return replace(self, points=points, offsets=offsets)
+
     @property
     def middle(self) -> Tensor:
         """(B, 2) px, of the picture."""

@@ -25,7 +25,8 @@ from torchptz.estimation.residuals import State, straightness
 # patterns loses one.
 CUT = 4.5
 
-_RICH = (1.0, 2.0, 3.0, 4.0, 5.0)
+# Powers enough to follow any lens.
+RICH = (1.0, 2.0, 3.0, 4.0, 5.0)
 _FAR_STARTS, _FAR = 6, 0.7  # centres so many units of r away
 _FAR_PENALTY = 4.0  # on their mean square: with a centre far off, few lines are easily straightened
 _SUBSETS = 20  # of the lines tried as a start
@@ -109,7 +110,7 @@ def find_inliers(problem: Problem, center: Tensor) -> Inliers:
 
     Source: Huber and Ronchetti, Robust Statistics; Rousseeuw and Leroy (least median of squares).
     """
-    problem = problem.with_powers(_RICH)
+    problem = problem.with_powers(RICH)
     started = on_arcs(problem)
     cleaned = problem.using(started)
     free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=center.device)

@@ -49,11 +49,9 @@ class Status(Enum):
     NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
 
 
-def too_few(problem: Problem) -> Tensor:
-    """(B,) bool: fewer degrees of freedom than unknowns, or lines in too few places."""
-    return (problem.line_count < 3) | (
-        problem.count - 2 * problem.line_count - problem.unknowns < 1
-    )
+def too_few(problem: Problem, unknowns: Tensor) -> Tensor:
+    """(B,) bool: fewer degrees of freedom than unknowns (B,), or lines in too few places."""
+    return (problem.line_count < 3) | (problem.count - 2 * problem.line_count - unknowns < 1)
 
 
 def center_sigma(covariance: Tensor) -> Tensor:
@@ -105,6 +103,7 @@ def judge(
     lens: RadialLens,
     covariance: Tensor,
     *,
+    unknowns: Tensor,
     converged: Tensor,
     held: Tensor,
     outlying: Tensor,
@@ -116,6 +115,7 @@ def judge(
         problem: B items.
         lens: their lenses.
         covariance: (B, M, M).
+        unknowns: (B,) parameters asked for.
         converged: (B,) bool.
         held: (B,) bool, items whose centre was found unobservable and kept at its start.
         outlying: (B,) bool, items whose points do not lie on lines.
@@ -130,7 +130,7 @@ def judge(
             Status.OUTLIERS,
             outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
         ),
-        (Status.TOO_FEW_LINES, too_few(problem)),
+        (Status.TOO_FEW_LINES, too_few(problem, unknowns)),
         (
             Status.DISTORTION_UNOBSERVABLE,
             ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),

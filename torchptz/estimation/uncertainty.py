@@ -10,7 +10,7 @@ from torch import Tensor
 from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Linearised, Prior, masked, reduce_lines
-from torchptz.estimation.residuals import State, derivatives
+from torchptz.estimation.residuals import State, derivatives, straightness
 
 # Standard deviations by which residuals must hang together before they are believed to.
 _CLEAR = 4.0
@@ -48,8 +48,8 @@ def from_residuals(problem: Problem, state: State, free: Tensor) -> Uncertainty:
     Source: Gauss-Newton approximation of the information, with the lines eliminated.
     """
     linear, columns, residual = reduce_lines(problem, *derivatives(problem, state)[:3])
-    freedom = problem.count - 2 * problem.line_count - free.sum(-1)
-    rms = torch.where(freedom > 0, (linear.cost / freedom.clamp_min(1)).sqrt(), torch.nan)
+    freedom = _freedom(problem, free)
+    rms = _rms(linear.cost, freedom)
     normal = masked(linear.normal, free)
     inverse, failed = _inverse(normal)
     scores = (columns.mT @ residual.unsqueeze(-1)).squeeze(-1) * free[:, None]  # (B, L, M)
@@ -64,6 +64,21 @@ def from_residuals(problem: Problem, state: State, free: Tensor) -> Uncertainty:
     )
     both = free[:, :, None] & free[:, None]
     return Uncertainty(rms, inflation, torch.where(both, covariance, 0.0), linear)
+
+
+def rms_of(problem: Problem, state: State, free: Tensor) -> Tensor:
+    """(B,) px, residuals of the points used, per degree of freedom; differentiable."""
+    used = problem.weight > 0
+    squares = torch.where(used, straightness(problem, state), 0.0) ** 2
+    return _rms((problem.weight * squares).sum((1, 2)), _freedom(problem, free))
+
+
+def _rms(cost: Tensor, freedom: Tensor) -> Tensor:
+    return torch.where(freedom > 0, (cost / freedom.clamp_min(1)).sqrt(), torch.nan)
+
+
+def _freedom(problem: Problem, free: Tensor) -> Tensor:
+    return problem.count - 2 * problem.line_count - free.sum(-1)
 
 
 def _inflation(
