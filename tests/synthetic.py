@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -130,6 +131,64 @@ def noisy(pattern: LinePatterns, sigma: float, draws: int = 1, seed: int = 0) ->
         copies(pattern.offsets),
         copies(pattern.sigma),
     )
+
+
+def with_gross_errors(
+    pattern: LinePatterns, share: float, low: float = 5.0, high: float = 60.0, seed: int = 0
+) -> tuple[LinePatterns, Tensor]:
+    """A ``share`` of the points of `noisy` chords moved off their lines by low to high px, either
+    way; and which (B, L, P) bool."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape):
+        return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    along = pattern.points[:, :, 2:] - pattern.points[:, :, :-2]
+    along = torch.cat([along[:, :, :1], along, along[:, :, -1:]], 2)
+    across = torch.stack([-along[..., 1], along[..., 0]], -1)
+    across = across / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+    wrong = (uniform(*pattern.mask.shape) < share) & pattern.mask
+    size = low + (high - low) * uniform(*wrong.shape)
+    size = torch.where(uniform(*wrong.shape) < 0.5, size, -size)
+    moved = pattern.points + size.unsqueeze(-1) * across
+    return replace(pattern, points=torch.where(wrong.unsqueeze(-1), moved, pattern.points)), wrong
+
+
+def explicit_residuals(
+    pattern: LinePatterns,
+    theta: np.ndarray,
+    angle: np.ndarray,
+    offset: np.ndarray,
+    powers=(1, 2, 3),
+    pixel_aspect: float = 1.0,
+) -> np.ndarray:
+    """Residuals (L, P) px of a batch of one by the definition, every unknown explicit, in numpy.
+
+    ``theta`` is the centre, the coefficients and no, one or two gains; angle and offset (L,) are
+    the lines' normals and their places from the middle of the picture. Over the sigmas if there
+    are any, relative to their weights' mean.
+    """
+    points, size = pattern.points[0].numpy(), pattern.image_size[0].numpy()
+    powers = np.asarray(powers, dtype=np.float64)
+    center, coefficients, gain = np.split(theta, [2, 2 + len(powers)])
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1)[:, None]
+    away = points - center
+    square = np.array([pixel_aspect**2, 1.0])
+    radius = np.sqrt((square * away**2).sum(-1)) / (size[0] / 2)
+    bend = 1 + (coefficients * radius[..., None] ** powers).sum(-1)
+    slope = (powers * coefficients * radius[..., None] ** (powers - 2)).sum(-1)
+    corrected = center + bend[..., None] * away - (size - 1) / 2
+    if len(gain):
+        corrected = corrected - gain * pattern.offsets[0].numpy()
+    distance = (normal * corrected).sum(-1) + offset[:, None]
+    lever = ((normal * away).sum(-1) * slope)[..., None]
+    gradient = bend[..., None] * normal + lever * square * away / (size[0] / 2) ** 2
+    residual = distance / np.linalg.norm(gradient, axis=-1)
+    mask = pattern.mask[0].numpy()
+    if pattern.sigma is not None:
+        weight = np.where(mask, 1 / pattern.sigma[0].numpy() ** 2, 0.0)
+        residual = residual * np.sqrt(weight / weight[mask].mean())
+    return np.where(mask, residual, 0.0)
 
 
 def head_pattern(

@@ -186,12 +186,12 @@ class TestErrors:
         proud = replace(fit, covariance=1e-4 * fit.covariance)
         errors = section.Errors.of(proud, projection, truth)
         names = [f"lens {i}" for i in range(FEW)]
-        found = section._offenders(errors, proud, names)
+        found = section.offenders(errors, proud, names)
         fine = sum(status is Status.OK for status in fit.status)
         assert found["offending"] > fine / 2
         assert {one["name"] for one in found["offenders"]} <= set(names)
         warned = replace(proud, status=[Status.OUTLIERS] * FEW)
-        assert section._offenders(errors, warned, names)["offending"] == 0
+        assert section.offenders(errors, warned, names)["offending"] == 0
 
     def test_a_lens_that_folds_where_the_truth_does_not_is_an_offence(self, section, truth, judged):
         fit, projection = judged
@@ -205,7 +205,7 @@ class TestErrors:
         factor = torch.randn(3, 3, generator=generator, dtype=torch.float64)
         draws = torch.randn(20000, 3, generator=generator, dtype=torch.float64) @ factor.T
         covariance = (factor @ factor.T).expand(len(draws), -1, -1)
-        assert section._normalised(draws, covariance) == pytest.approx(1, abs=0.02)
+        assert section.normalised(draws, covariance) == pytest.approx(1, abs=0.02)
 
 
 class TestSection:

@@ -21,8 +21,9 @@ from torchptz.patterns import LinePatterns
 TITLE = "A catalogue of the degenerate and the hostile"
 SEEDS, QUICK_SEEDS = 8, 1
 SIGMAS = 5.0  # an item that is OK is within so many of its own
+_WIDTH = 640  # px of the picture that limits in px are for
 ALIKE_PX = 1e-9  # alone and in the batch
-_EXACT_PX = 1e-6  # what an error may be where the points are exact, in pictures of 640 px
+_EXACT_PX = 1e-6  # what an error may be where the points are exact
 _LEAST_SIGMA = 0.1  # of the largest one over the picture
 _KEPT, _CAUGHT = 0.9, 0.99  # shares of right and wrong points: a good line may go with the bad
 # Statuses whose lens is said to be right, as far as its covariance goes.
@@ -58,7 +59,7 @@ def measure(item: Item, fit: Fit) -> Measured:
             got = fit.lens.undistort(torch.from_numpy(pixels)[None])[0].numpy()
             off = np.linalg.norm(got - item.truth.undistort(pixels), axis=-1)
             error = float(np.nan_to_num(off, nan=np.inf).max())
-            exact = _EXACT_PX * item.image_size[0] / 640
+            exact = _EXACT_PX * item.image_size[0] / _WIDTH
             beyond = (off - item.truth.representation_px - exact).clip(0)
             # Near the centre all is known, and an error of second order to be expected.
             ratio = beyond / known.numpy().clip(max(_LEAST_SIGMA * sigma, 1e-300))
@@ -106,12 +107,16 @@ def solve(items: list[Item]) -> tuple[Fit, list[Fit]]:
 
 
 def apart(item: Item, one: Fit, other: Fit) -> tuple[float, float]:
-    """Largest distance, px: between two centres, and between two corrections over the picture."""
+    """Largest distances between two centres, and between two corrections over the picture.
+
+    In px of a picture of 640: in one of a million px, rounding alone is more than a fixed limit.
+    """
+    unit = _WIDTH / item.image_size[0]
     pixels = torch.from_numpy(picture_grid(item.image_size))[None]
     centers = one.lens.center - other.lens.center
     corrections = one.lens.undistort(pixels) - other.lens.undistort(pixels)
     return tuple(
-        float(torch.linalg.vector_norm(off, dim=-1).nan_to_num(nan=math.inf).max())
+        float(torch.linalg.vector_norm(off, dim=-1).nan_to_num(nan=math.inf).max()) * unit
         for off in (centers, corrections)
     )
 

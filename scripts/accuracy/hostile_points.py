@@ -87,7 +87,7 @@ def one_line_that_changes_its_feature(random: Generator) -> Item:
 @case(OUTLIERS, NO_DISTORTION, OK)
 def half_of_the_lines_wrong(random: Generator) -> Item:
     """Which half is the wrong one cannot be promised: OK is right only with the right lens."""
-    return replace(with_wrong_lines(healthy(random), random, 7), wrong=None)
+    return with_wrong_lines(healthy(random), random, 7)
 
 
 @case(OUTLIERS, NO_DISTORTION, NOT_CONVERGED, NOT_MONOTONIC)

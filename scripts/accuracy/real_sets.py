@@ -23,7 +23,7 @@ SETS = (
     *("opencv_left", "carnd_wide", "pjlab_harp"),
     *("discorpy_laptop", "discorpy_line01", "discorpy_dot02"),
 )
-QUICK_SETS = ("opencv_left", "pjlab_harp")
+QUICK_SETS = ("discorpy_laptop", "pjlab_harp")
 POWERS = ((1, 2, 3), (2, 4, 6), (1, 2, 3, 4, 5))
 QUICK_POWERS = ((1, 2, 3),)
 AUTO, OURS, SCIPY = "auto", "ml", "scipy"

@@ -1,11 +1,14 @@
 """Centre step: gradient of the refitted objective, descent, and staying where nothing is seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from tests import synthetic
-from torchptz.estimation.center import _derivatives, center_step
+from torchptz.estimation.center import _derivatives, center_step, distance_gradient
+from torchptz.estimation.lines import fit_lines
 from torchptz.estimation.problem import Problem
 from torchptz.patterns import LinePatterns
 
@@ -38,7 +41,7 @@ class TestGradient:
         if with_gain:
             generator = torch.Generator().manual_seed(0)
             offsets = torch.randn(problem.points.shape, generator=generator, dtype=torch.float64)
-            problem = Problem(**{**vars(problem), "offsets": offsets})
+            problem = replace(problem, offsets=offsets)
             gain = synthetic.double(0.8, 1.1)
         coefficients = torch.cat([one.coefficients for one in lenses]) * 0.8
         center = synthetic.double(319.5, 239.5).expand(2, 2)
@@ -99,3 +102,36 @@ class TestStep:
         for i in range(3):
             alone = center_step(problem[i], start[i : i + 1], coefficients[i : i + 1])
             torch.testing.assert_close(together[i : i + 1], alone, atol=1e-9, rtol=0)
+
+
+class TestDistanceGradient:
+    LENSES = (
+        synthetic.lens((0.05, 0.15, 0.02)),
+        synthetic.lens((0.02, 0.05, 0.0), pixel_aspect=0.87),
+    )
+
+    def case(self, powers):
+        problem = problem_of(*self.LENSES, pixel_aspect=synthetic.double(1.0, 0.87))
+        problem = problem.with_powers(powers)
+        center = torch.cat([one.center for one in self.LENSES])
+        coefficients = torch.cat([one.coefficients for one in self.LENSES])
+        normal = fit_lines(problem.correct(center, coefficients), problem.weight).normal
+        return problem, center, coefficients, normal
+
+    @pytest.mark.parametrize("powers", [(1.0, 2.0, 3.0), (0.5, 2.0, 4.0)])
+    def test_it_is_that_of_autograd(self, powers):
+        problem, center, coefficients, normal = self.case(powers)
+        points = problem.points.clone().requires_grad_()
+        corrected = replace(problem, points=points).correct(center, coefficients)
+        distance = (corrected * normal[:, :, None]).sum(-1)
+        (gradient,) = torch.autograd.grad(distance.sum(), points)
+        got = distance_gradient(problem, center, coefficients, normal)
+        torch.testing.assert_close(got, gradient)
+
+    def test_it_is_the_normal_without_distortion_and_at_the_centre(self):
+        problem, center, coefficients, normal = self.case((1.0, 2.0, 3.0))
+        none = distance_gradient(problem, center, 0 * coefficients, normal)
+        torch.testing.assert_close(none, normal[:, :, None].expand_as(none))
+        problem.points[:, 0, 0] = center
+        at_center = distance_gradient(problem, center, coefficients, normal)[:, 0, 0]
+        torch.testing.assert_close(at_center, normal[:, 0])

@@ -1,5 +1,7 @@
 """The paper's loop: its convergence figures, its stops, and independent items."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -145,7 +147,7 @@ class TestItems:
             points[0, :, ::2], points[0, :, 1::2] = synthetic.double(100.0, 80.0), 200.0
         else:
             points[0, 3, 4, 1] = bad
-        together = iterate(Problem(**{**vars(problem), "points": points}), MIDDLE.expand(2, 2))
+        together = iterate(replace(problem, points=points), MIDDLE.expand(2, 2))
         assert together.iterations[1] == alone.iterations[0]
         torch.testing.assert_close(together.center[1], alone.center[0], atol=1e-6, rtol=0)
         assert together.center[0].isfinite().all()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined, refine, settle_lines
 from torchptz.estimation.residuals import State, split, straightness
 from torchptz.estimation.selection import UNION, solve_with_best_powers
-from torchptz.estimation.solution import Search, Solution, solve, solve_robustly
+from torchptz.estimation.solution import GAIN_SIGMA, Search, Solution, solve, solve_robustly
 from torchptz.estimation.status import Status, judge
 from torchptz.estimation.uncertainty import (
     rms_of,
@@ -120,7 +120,8 @@ def estimate(
                 used, solution = solve_robustly(problem, search, solver)
             else:
                 used, solution = problem, solve(problem, search, solver)
-        return _as_fit(used, patterns, search, solution)
+        # The problem itself: it knows the points' gradients.
+        return _as_fit(replace(problem, weight=used.weight), patterns, search, solution)
 
     size = patterns.image_size.double()
     start = ((size - 1) / 2 if center is None else center.to(size)).expand_as(size)
@@ -159,10 +160,13 @@ def _loop(
     gains = start.new_ones(len(start), problem.unknowns - 2 - len(problem.powers))
     theta = torch.cat([loop.center, loop.coefficients, gains], 1)
     state = State.from_parameters(problem, theta)
+    plain = Refined(settle_lines(problem, state), loop.iterations, loop.converged)
     if gain is None:
-        return Refined(settle_lines(problem, state), loop.iterations, loop.converged)
+        return plain
     refined = refine(problem, state, free, prior)
-    return Refined(refined.state, loop.iterations + refined.iterations, refined.converged)
+    offsets = free[:, 2 + len(problem.powers) :].any(-1)
+    joint = Refined(refined.state, loop.iterations + refined.iterations, refined.converged)
+    return joint.where(offsets, plain)
 
 
 def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: Solution) -> Fit:
@@ -200,6 +204,7 @@ def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: 
     gain_sigma = None
     if gain is not None:
         gain_sigma = covariance[:, size:, size:].diagonal(dim1=1, dim2=2).sqrt()
+        gain_sigma = torch.where(free[:, size:], gain_sigma, GAIN_SIGMA)
         if not problem.gain_per_axis:
             gain, gain_sigma = gain[:, 0], gain_sigma[:, 0]
     covariance = covariance[:, :size, :size]

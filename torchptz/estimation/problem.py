@@ -83,6 +83,21 @@ class Problem(Batched):
         total = weight.sum((1, 2), keepdim=True)
         return replace(self, weight=weight * torch.where(total > 0, count / total, 0.0))
 
+    def trimmed(self) -> Problem:
+        """The same problem without lines and places that are padding in all items."""
+        lines = self.mask.any(2).any(0).nonzero()
+        places = self.mask.any(1).any(0).nonzero()
+        if len(lines) == 0:
+            return self
+        kept = (slice(None), slice(int(lines[-1]) + 1), slice(int(places[-1]) + 1))
+        return replace(
+            self,
+            points=self.points[kept],
+            mask=self.mask[kept],
+            weight=self.weight[kept],
+            offsets=None if self.offsets is None else self.offsets[kept],
+        )
+
     def with_powers(self, powers: Sequence[float]) -> Problem:
         """The same problem for a lens of other powers."""
         return replace(
@@ -103,6 +118,20 @@ class Problem(Batched):
         """M: centre, coefficients and gains."""
         gains = 0 if self.offsets is None else 1 + self.gain_per_axis
         return 2 + len(self.powers) + gains
+
+    @property
+    def known(self) -> Tensor:
+        """(B, M) bool, parameters that the data have something to say of: no gains of offsets that
+        are all zero, as those of an item are whose neighbours alone have offsets."""
+        known = torch.ones(
+            len(self.points), self.unknowns, dtype=torch.bool, device=self.points.device
+        )
+        if self.offsets is not None:
+            some = (self.offsets != 0) & (self.weight > 0).unsqueeze(-1)
+            by_axis = some.any((1, 2))
+            gains = by_axis if self.gain_per_axis else by_axis.any(-1, keepdim=True)
+            known[:, 2 + len(self.powers) :] = gains
+        return known
 
     @property
     def count(self) -> Tensor:

@@ -41,6 +41,7 @@ _FEWEST_POINTS = 3
 _TELLING_POINTS, _TELLING_LINES = 5, 6  # fewer say nothing of how lines differ
 _EXCESS = 3.0  # standard deviations
 _RIDDEN = 5.0
+_ROUGH, _HOPELESS = 0.005, 0.02  # of the half width: no feature is found so badly
 _MISFIT = 3.0  # residuals so many times the noise between neighbours are not noise
 
 
@@ -60,6 +61,7 @@ def suspicious(problem: Problem, residual: Tensor, freedom: Tensor) -> Tensor:
     sigma = torch.maximum(sigma, FINEST * problem.scale)
     noise = torch.maximum(neighbour_noise(problem), FINEST * problem.scale)
     within = (whitened.abs().amax((1, 2)) <= CUT * sigma) & (sigma <= _MISFIT * noise)
+    within &= sigma <= _ROUGH * problem.scale  # else even neighbours may be out of line
     return ~within | bad_lines(problem.weight > 0, whitened, sigma[:, None]).any(-1)
 
 
@@ -113,7 +115,7 @@ def find_inliers(problem: Problem, center: Tensor) -> Inliers:
     problem = problem.with_powers(RICH)
     started = on_arcs(problem)
     cleaned = problem.using(started)
-    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=center.device)
+    free = problem.known
     state = start_from_loop(cleaned, center, free, _LOOP_STEPS)
     state = refine(cleaned, state, free, max_steps=_START_STEPS).state
     inliers, found = _settle(problem, state, started)
@@ -131,7 +133,8 @@ def find_inliers(problem: Problem, center: Tensor) -> Inliers:
     variance = torch.where(inliers, residual, 0.0).square().sum((1, 2)) / freedom.clamp_min(1)
     noise = torch.maximum(neighbour_noise(chosen), FINEST * problem.scale)
     rms = variance.sqrt()
-    return Inliers(inliers, found.theta[:, :2], rms, rms > _RIDDEN * noise)
+    doubtful = (rms > _RIDDEN * noise) | (rms > _HOPELESS * problem.scale)
+    return Inliers(inliers, found.theta[:, :2], rms, doubtful)
 
 
 def _still_suspicious(problem: Problem, inliers: Tensor, state: State) -> Tensor:
@@ -145,7 +148,7 @@ def _still_suspicious(problem: Problem, inliers: Tensor, state: State) -> Tensor
 def _settle(problem: Problem, state: State, started: Tensor) -> tuple[Tensor, State]:
     """Inliers (B, L, P) from a robust start, by reweighting, then the cut until nothing changes;
     and the fit to them."""
-    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=started.device)
+    free = problem.known
     state = _redescend(problem, state, started)
     inliers = _within(problem, state, started)
     for _ in range(_ROUNDS):
@@ -174,7 +177,7 @@ def _best_start(problem: Problem, center: Tensor) -> tuple[Tensor, Tensor]:
     chosen = copies.using(
         subsets.reshape(many * batch, lines, 1).expand(-1, -1, copies.weight.shape[2])
     )
-    free = torch.ones(many * batch, problem.unknowns, dtype=torch.bool, device=center.device)
+    free = chosen.known
     state = start_from_loop(chosen, centers, free, _LOOP_STEPS)
     state = refine(chosen, state, free, max_steps=_START_STEPS).state
     judged = State.from_parameters(copies, state.theta)
@@ -207,7 +210,7 @@ def _subsets(present: Tensor) -> Tensor:
 
 def _redescend(problem: Problem, state: State, started: Tensor) -> State:
     """Tukey's biweight from a robust start: reweighted joint steps."""
-    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=started.device)
+    free = problem.known
     used = problem.weight > 0
     root = problem.weight.sqrt()
     weighed = started

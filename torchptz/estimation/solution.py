@@ -19,7 +19,7 @@ from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 # The gain of the known offsets is 1 up to how well the focal length was assumed, and to what the
 # head's readings are worth. Where poses leave the offsets next to no variation, as at the long end,
 # a free gain runs away and takes the lens along.
-_GAIN_SIGMA = 0.3
+GAIN_SIGMA = 0.3
 
 # (problem, centre to start from, free parameters, prior) -> where the search ended
 Solver = Callable[[Problem, Tensor, Tensor, Prior | None], Refined]
@@ -61,7 +61,7 @@ class Search(Batched):
             information[:, :2, :2] = torch.linalg.inv(self.covariance)
         for i in range(problem.unknowns - gains, problem.unknowns):
             mean[:, i] = 1
-            information[:, i, i] = 1 / _GAIN_SIGMA**2
+            information[:, i, i] = 1 / GAIN_SIGMA**2
         return Prior(mean, information)
 
 
@@ -73,7 +73,7 @@ def solve(problem: Problem, search: Search, solver: Solver) -> Solution:
         search: of their centres.
         solver: for given free parameters.
     """
-    free = torch.ones(len(problem), problem.unknowns, dtype=torch.bool, device=search.start.device)
+    free = problem.known
     prior = search.prior(problem)
     solution = as_solution(problem, solver(problem, search.start, free, prior), free)
     # Next to no distortion leaves the centre undetermined, and it would drag L along.
@@ -99,13 +99,19 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
         The problem, of the inliers only, and its solution.
     """
     solution = solve(problem, search, solver)
-    freedom = problem.count - 2 * problem.line_count - problem.unknowns
+    freedom = problem.count - 2 * problem.line_count - solution.free.sum(-1)
     residual = straightness(problem, solution.refined.state)
     rows = suspicious(problem, residual, freedom).nonzero()[:, 0]
     if len(rows) == 0:
         return problem, solution
-    inliers = find_inliers(problem[rows], search.start[rows])
-    cleaned, near = problem[rows].using(inliers.mask), search[rows]
+    # Not at the cost of the padding that other items need.
+    items = problem[rows].trimmed()
+    inliers = find_inliers(items, search.start[rows])
+    _, lines, places = problem.mask.shape
+    _, some_lines, some_places = items.mask.shape
+    padding = (0, places - some_places, 0, lines - some_lines)
+    mask = torch.nn.functional.pad(inliers.mask, padding)
+    cleaned, near = problem[rows].using(mask), search[rows]
     # From where the lens was looked for, or where the inliers were found, whichever is better.
     tries = [solve(cleaned, replace(near, start=s), solver) for s in (near.start, inliers.center)]
     again = tries[0].where(~(tries[1].known.rms < tries[0].known.rms), tries[1])

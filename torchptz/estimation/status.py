@@ -20,9 +20,9 @@ SEEN_LIMIT = 10.0
 # known.
 BORDER_SIGMA_LIMIT = 0.01
 # Residuals so many times those that richer powers leave are the lens', not the points'.
-MISFIT_LIMIT = 2.0
+MISFIT_LIMIT = 1.4
 # With fewer inliers than this share of the points, others could pass for them.
-INLIER_SHARE_LIMIT = 0.6
+INLIER_SHARE_LIMIT = 0.65
 
 
 class Status(Enum):
@@ -49,9 +49,15 @@ class Status(Enum):
     NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
 
 
-def too_few(problem: Problem, unknowns: Tensor) -> Tensor:
-    """(B,) bool: fewer degrees of freedom than unknowns (B,), or lines in too few places."""
-    return (problem.line_count < 3) | (problem.count - 2 * problem.line_count - unknowns < 1)
+def too_few(used: Tensor, unknowns: Tensor) -> Tensor:
+    """(B,) bool: fewer degrees of freedom than unknowns (B,), or lines in too few places.
+
+    Args:
+        used: (B, L, P) bool, points.
+        unknowns: (B,) beside the lines.
+    """
+    lines = used.any(-1).sum(-1)
+    return (lines < 3) | (used.sum((1, 2)) - 2 * lines - unknowns < 1)
 
 
 def center_sigma(covariance: Tensor) -> Tensor:
@@ -126,11 +132,12 @@ def judge(
     """
     inlier_share = problem.count / problem.mask.sum((1, 2)).clamp_min(1)
     reasons = [
+        (Status.TOO_FEW_LINES, too_few(problem.mask, unknowns)),
         (
             Status.OUTLIERS,
             outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
         ),
-        (Status.TOO_FEW_LINES, too_few(problem, unknowns)),
+        (Status.TOO_FEW_LINES, too_few(problem.weight > 0, unknowns)),
         (
             Status.DISTORTION_UNOBSERVABLE,
             ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),
