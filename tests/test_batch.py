@@ -114,6 +114,26 @@ class TestWhere:
         assert both.value.isnan().all(1).tolist() == [False, True]
 
 
+class TestJoining:
+    def test_parts_come_one_after_the_other_nested_ones_too(self):
+        whole = Outer.cat([batch(2), batch(1, first=5), batch(3, first=7)])
+        assert values(whole) == [0, 1, 5, 7, 8, 9]
+        assert whole.names == ("a", "b", "c")
+        assert whole.nothing is None
+
+    def test_lists_are_joined_along(self):
+        parts = [Listed(torch.arange(2), ["x", "y"]), Listed(torch.arange(1), ["z"])]
+        assert Listed.cat(parts).said == ["x", "y", "z"]
+
+    def test_one_part_is_the_whole(self):
+        part = batch()
+        assert Outer.cat([part]) is part
+
+    def test_what_was_cut_apart_is_whole_again(self):
+        whole = batch(5)
+        assert values(Outer.cat([whole[:2], whole[2:4], whole[4:]])) == values(whole)
+
+
 def test_tensors_go_to_a_device_nested_ones_too():
     moved = batch().to("meta")
     assert moved.value.is_meta

@@ -1,4 +1,6 @@
-"""`estimate` as a whole: the paper's lens, options, errors, dtypes, independent items."""
+"""`estimate` as a whole: the paper's lens, methods, gains, priors, errors, dtypes, items."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,17 +14,25 @@ from torchptz.patterns import LinePatterns
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
 
+MIDDLE = synthetic.double(319.5, 239.5)[None]
 
-def barrel(sigma=0.1, points=12, seed=0, **lens):
+
+def barrel(sigma=0.1, points=12, seed=0, draws=1, **lens):
     pattern = synthetic.pattern_of(synthetic.lens(**lens), points=points)
-    return synthetic.noisy(pattern, sigma, seed=seed)
+    return synthetic.noisy(pattern, sigma, draws, seed=seed)
+
+
+def parameters(fit):
+    return torch.cat([fit.lens.center, fit.lens.coefficients], 1)
 
 
 class TestPaper:
     """The paper's synthetic lens, 496 points on 14 lines."""
 
-    def test_free_of_noise_it_is_found_out_to_the_corners(self):
-        fit = estimate(synthetic.stacked(synthetic.paper_pattern()))
+    @pytest.mark.parametrize("method", ["ml", "lanz"])
+    def test_free_of_noise_it_is_found_out_to_the_corners(self, method):
+        pattern = synthetic.stacked(synthetic.paper_pattern())
+        fit = estimate(pattern, method=method, robust=False)
         assert fit.status == [Status.OK]
         assert synthetic.largest_error(fit.lens, synthetic.PAPER, similarity=True) < 0.02
         assert synthetic.largest_error(fit.lens, synthetic.PAPER, similarity=False) < 0.06
@@ -32,9 +42,10 @@ class TestPaper:
         )
         assert np.linalg.norm(fit.lens.center[0].numpy() - synthetic.PAPER_CENTER) < 0.01
 
-    def test_noise_is_reported_and_known_to_move_the_centre(self):
+    @pytest.mark.parametrize("method", ["ml", "lanz"])
+    def test_noise_is_reported_and_known_to_move_the_centre(self, method):
         pattern = synthetic.stacked(synthetic.paper_pattern())
-        fit = estimate(synthetic.noisy(pattern, 0.05, draws=10))
+        fit = estimate(synthetic.noisy(pattern, 0.05, draws=10), method=method)
         assert fit.status == [Status.OK] * 10
         np.testing.assert_allclose(fit.rms_px, 0.05, rtol=0.12)
         off = fit.lens.center - torch.from_numpy(synthetic.PAPER_CENTER)
@@ -42,6 +53,33 @@ class TestPaper:
         chi = (off * whitened).sum(-1)
         assert chi.mean() < 2 * 2
         assert chi.max() < 20
+
+
+class TestMethods:
+    def test_the_default_is_ml_and_robust(self):
+        spoilt, wrong = synthetic.with_gross_errors(barrel(points=25), 0.05)
+        default, told = estimate(spoilt), estimate(spoilt, method="ml", robust=True)
+        assert torch.equal(parameters(default), parameters(told))
+        assert not (default.inliers & wrong).any()
+
+    def test_ml_is_straighter_than_the_papers_in_distorted_pixels(self):
+        pattern = barrel(sigma=0.3, points=20, draws=12, coefficients=(0.1, 0.35, 0.05))
+        ml, paper = estimate(pattern, robust=False), estimate(pattern, method="lanz")
+        assert (ml.rms_px < paper.rms_px).all()
+
+    def test_ml_is_nearer_to_the_truth_on_average(self):
+        lens = synthetic.lens((0.1, 0.35, 0.05))
+        pattern = barrel(sigma=0.3, points=20, draws=40, coefficients=(0.1, 0.35, 0.05))
+        squares = [
+            (fit.lens.center - lens.center).square().sum(-1).mean()
+            for fit in (estimate(pattern, robust=False), estimate(pattern, method="lanz"))
+        ]
+        assert squares[0] < 0.95 * squares[1]
+
+    def test_free_of_noise_they_agree(self):
+        pattern = barrel(sigma=0.0, points=15)
+        ml, paper = estimate(pattern), estimate(pattern, method="lanz")
+        torch.testing.assert_close(parameters(ml), parameters(paper), atol=1e-4, rtol=0)
 
 
 class TestResult:
@@ -52,15 +90,24 @@ class TestResult:
         assert fit.lens.coefficients.shape == (2, 2)
         assert fit.covariance.shape == (2, 4, 4)
         assert fit.rms_px.shape == fit.iterations.shape == (2,)
-        assert fit.residuals.shape == patterns.mask.shape
+        assert fit.residuals.shape == fit.inliers.shape == patterns.mask.shape
+        assert fit.inliers.dtype == torch.bool
         assert fit.gain is None
         assert fit.gain_sigma is None
+        assert fit.systematic_covariance is None
         assert fit.lens.powers.tolist() == [2, 4]
         torch.testing.assert_close(fit.lens.scale, synthetic.double(320.0, 320.0))
 
-    def test_rms_is_that_of_the_residuals_per_degree_of_freedom(self):
-        patterns = barrel()
-        fit = estimate(patterns)
+    def test_items_of_it(self):
+        fit = estimate(barrel(draws=3))
+        last = fit[2]
+        assert last.status == fit.status[2:]
+        assert torch.equal(last.lens.center, fit.lens.center[2:])
+        assert torch.equal(last.inliers, fit.inliers[2:])
+
+    @pytest.mark.parametrize("method", ["ml", "lanz"])
+    def test_rms_is_that_of_the_residuals_per_degree_of_freedom(self, method):
+        fit = estimate(barrel(), method=method)
         freedom = 14 * 12 - 2 * 14 - 5
         expected = (fit.residuals.square().sum() / freedom).sqrt()
         torch.testing.assert_close(fit.rms_px[0], expected)
@@ -70,6 +117,7 @@ class TestResult:
         patterns = synthetic.stacked(lines)
         fit = estimate(patterns)
         assert (fit.residuals[~patterns.mask] == 0).all()
+        assert not fit.inliers[~patterns.mask].any()
 
     @given(
         l2=st.floats(0.03, 0.12),
@@ -84,7 +132,7 @@ class TestResult:
         fit = estimate(synthetic.pattern_of(lens, points=10))
         assert fit.status == [Status.OK]
         truth = synthetic.truth_of(lens)
-        assert synthetic.largest_error(fit.lens, truth, similarity=False) < 1e-3 * size
+        assert synthetic.largest_error(fit.lens, truth, similarity=False) < 1e-6 * size
 
     def test_given_sigmas_keep_bad_points_from_weighing(self):
         pattern = barrel(sigma=0.05)
@@ -93,34 +141,186 @@ class TestResult:
         noise[:, :, ::4] = 3 * torch.randn(noise[:, :, ::4].shape, generator=generator).double()
         sigma = torch.full(pattern.mask.shape, 0.05, dtype=torch.float64)
         sigma[:, :, ::4] = 3.0
-        spoilt = LinePatterns(pattern.points + noise, pattern.mask, pattern.image_size)
-        told = LinePatterns(spoilt.points, spoilt.mask, spoilt.image_size, sigma=sigma)
+        spoilt = replace(pattern, points=pattern.points + noise)
         truth = synthetic.truth_of(synthetic.lens())
         blind, knowing = (
-            synthetic.largest_error(estimate(p).lens, truth, similarity=True)
-            for p in (spoilt, told)
+            synthetic.largest_error(estimate(p, robust=False).lens, truth, similarity=True)
+            for p in (spoilt, replace(spoilt, sigma=sigma))
         )
         assert knowing < 1.0
         assert blind > 4 * knowing
 
+    def test_systematic_errors_of_the_patterns_are_told_apart(self):
+        pattern = barrel()
+        away = (pattern.points - MIDDLE) / 320
+        bend = torch.stack([0.2 * away**2, 0.1 * away.flip(-1) ** 2], -1)
+        fit = estimate(replace(pattern, systematic=bend))
+        plain = estimate(pattern)
+        assert torch.equal(fit.covariance, plain.covariance)
+        assert fit.systematic_covariance.shape == (1, 5, 5)
+        assert (torch.linalg.eigvalsh(fit.systematic_covariance) > -1e-9).all()
+        sigma = fit.lens.displacement_sigma(pattern.points[:, :, 0], fit.systematic_covariance)
+        assert 0.01 < float(sigma.max()) < 1
 
-class TestOptions:
-    def test_the_centre_may_start_elsewhere(self):
+
+class TestGains:
+    def made(self, gain, draws=40, sigma=0.05):
+        """Points as far beside their lines as their offsets say, times ``gain`` (two)."""
+        lens = synthetic.lens()
+        truth = synthetic.truth_of(lens)
+        generator = np.random.default_rng(0)
+        lines, offsets = [], []
+        for line in synthetic.chords(truth, points=12, border=20.0):
+            offset = generator.normal(0, 2.0, line.shape)
+            lines.append(truth.distort(truth.undistort(line) + gain * offset))
+            offsets.append(offset)
+        return synthetic.noisy(synthetic.stacked(lines, offsets=offsets), sigma, draws)
+
+    def test_one_serves_both_axes(self):
+        fit = estimate(self.made(np.array([1.2, 1.2])))
+        assert fit.gain.shape == fit.gain_sigma.shape == (40,)
+        chi = ((fit.gain - 1.2) / fit.gain_sigma).square()
+        assert 0.4 < float(chi.mean()) < 1.8
+        assert fit.status == [Status.OK] * 40
+
+    def test_each_axis_may_have_its_own(self):
+        pattern = self.made(np.array([1.2, 0.8]))
+        fit = estimate(pattern, gain_per_axis=True)
+        assert fit.gain.shape == fit.gain_sigma.shape == (40, 2)
+        assert fit.covariance.shape == (40, 5, 5)
+        chi = ((fit.gain - synthetic.double(1.2, 0.8)) / fit.gain_sigma).square().mean(0)
+        assert ((chi > 0.4) & (chi < 1.8)).all()
+        np.testing.assert_allclose(fit.rms_px, 0.05, rtol=0.3)
+        one = estimate(pattern, robust=False)
+        assert (one.rms_px > 4 * fit.rms_px).all()
+
+    def test_two_for_what_is_one_cost_next_to_nothing(self):
+        pattern = self.made(np.array([1.1, 1.1]), draws=4)
+        one, two = estimate(pattern), estimate(pattern, gain_per_axis=True)
+        assert torch.linalg.vector_norm(one.lens.center - two.lens.center, dim=-1).max() < 1
+        off = (two.gain - one.gain[:, None]) / two.gain_sigma
+        assert off.abs().max() < 4
+
+    def test_of_a_head_that_is_wrong_in_one_axis_too(self):
+        pattern, truth = synthetic.head_pattern(3690.0, (0.0, 0.003, 0.0), assumed=1.0)
+        pattern = replace(pattern, offsets=pattern.offsets * synthetic.double(0.9, 1.1))
+        fit = estimate(pattern, gain_per_axis=True)
+        assert fit.status == [Status.OK]
+        off = (fit.gain - synthetic.double(1 / 0.9, 1 / 1.1)) / fit.gain_sigma
+        assert off.abs().max() < 4
+        mapping = synthetic.truth_of(truth)
+        assert synthetic.largest_error(fit.lens, mapping, similarity=True) < 0.3
+
+
+class TestCentrePrior:
+    def test_a_tight_one_pulls_and_a_loose_one_does_not(self):
+        pattern = barrel(sigma=0.2)
+        plain = estimate(pattern)
+        sure = plain.covariance[:, :2, :2].diagonal(dim1=1, dim2=2).sqrt()
+        mean = plain.lens.center + sure * synthetic.double(1.0, -1.0)
+        apart = []
+        for size in (0.01, 1.0, 1e4):
+            prior = torch.diag_embed((size * sure) ** 2)
+            fit = estimate(pattern, center=mean, center_covariance=prior)
+            assert fit.status == [Status.OK]
+            apart.append(float(((fit.lens.center - mean) / sure).abs().mean()))
+            expected = torch.linalg.inv(plain.covariance)
+            expected[:, :2, :2] += torch.linalg.inv(prior)
+            torch.testing.assert_close(
+                fit.covariance.diagonal(dim1=1, dim2=2),
+                torch.linalg.inv(expected).diagonal(dim1=1, dim2=2),
+                rtol=0.1,
+                atol=0,
+            )
+        assert apart[0] < 1e-3
+        assert 0.2 < apart[1] < 0.8
+        assert apart[2] > 0.999
+
+    def test_a_right_one_makes_estimates_better_and_they_know(self):
+        truth, draws = synthetic.lens(), 60
+        pattern = barrel(sigma=0.3, draws=draws)
+        generator = torch.Generator().manual_seed(1)
+        mean = truth.center + 2 * torch.randn(draws, 2, generator=generator, dtype=torch.float64)
+        prior = (4 * torch.eye(2, dtype=torch.float64)).expand(draws, 2, 2)
+        fit = estimate(pattern, center=mean, center_covariance=prior)
+        plain = estimate(pattern, center=mean)
+        off = parameters(fit) - parameters_of(truth)
+        chi = (off * torch.linalg.solve(fit.covariance, off[..., None])[..., 0]).mean(-1)
+        assert 0.8 < float(chi.mean()) < 1.3
+        errors = [(one.lens.center - truth.center).square().sum(-1).mean() for one in (fit, plain)]
+        assert errors[0] < 0.8 * errors[1]
+
+    def test_without_distortion_it_is_kept(self):
+        pattern = barrel(coefficients=(0.0, 0.0, 0.0), draws=5)
+        mean = synthetic.double(330.0, 231.0).expand(5, 2)
+        prior = torch.tensor([[[30.0, 4.0], [4.0, 26.0]]], dtype=torch.float64).expand(5, 2, 2)
+        fit = estimate(pattern, center=mean, center_covariance=prior)
+        assert fit.status == [Status.CENTER_UNOBSERVABLE] * 5
+        assert torch.equal(fit.lens.center, mean)
+        torch.testing.assert_close(fit.covariance[:, :2, :2], prior)
+        sigma = fit.covariance[:, 2:, 2:].diagonal(dim1=1, dim2=2).sqrt()
+        assert (fit.lens.coefficients.abs() < 4 * sigma).all()
+
+    def test_one_serves_all(self):
+        pattern = barrel(draws=3)
+        mean, prior = MIDDLE, torch.eye(2)[None]
+        one = estimate(pattern, center=mean, center_covariance=prior)
+        each = estimate(pattern, center=mean.expand(3, 2), center_covariance=prior.expand(3, 2, 2))
+        assert torch.equal(parameters(one), parameters(each))
+
+    def test_the_papers_method_has_none(self):
+        pattern = barrel()
+        prior = 1e-4 * torch.eye(2)[None]
+        told = estimate(pattern, method="lanz", center=MIDDLE, center_covariance=prior)
+        plain = estimate(pattern, method="lanz", center=MIDDLE)
+        assert torch.equal(parameters(told), parameters(plain))
+        torch.testing.assert_close(told.covariance, plain.covariance)
+
+
+def parameters_of(lens):
+    return torch.cat([lens.center, lens.coefficients], 1)
+
+
+class TestCentreStart:
+    def test_it_may_be_elsewhere(self):
         near = estimate(barrel(), center=torch.tensor([[326.0, 232.0]]))
         far = estimate(barrel(), center=torch.tensor([[290.0, 260.0]], dtype=torch.float64))
-        torch.testing.assert_close(near.lens.center, far.lens.center, atol=1e-2, rtol=0)
+        torch.testing.assert_close(near.lens.center, far.lens.center, atol=1e-7, rtol=0)
 
-    def test_the_default_start_is_the_middle_of_the_picture(self):
-        middle = estimate(barrel(), center=torch.tensor([[319.5, 239.5]]))
+    def test_the_default_is_the_middle_of_the_picture(self):
+        middle = estimate(barrel(), center=MIDDLE)
         assert torch.equal(estimate(barrel()).lens.center, middle.lens.center)
 
+    def test_far_off_nothing_wrong_is_ok(self):
+        pattern = barrel(sigma=0.2, draws=4)
+        truth = synthetic.truth_of(synthetic.lens())
+        for x, y in [(130.0, 0.0), (0.0, -130.0), (-100.0, 100.0)]:
+            for robust in (True, False):
+                start = MIDDLE + synthetic.double(x, y)
+                fit = estimate(pattern, robust=robust, center=start)
+                for i, status in enumerate(fit.status):
+                    if status is Status.OK:
+                        assert synthetic.largest_error(fit.lens[i], truth, similarity=True) < 4
+                    else:
+                        assert not robust
+
+    def test_it_is_kept_where_the_centre_is_unobservable(self):
+        start = torch.tensor([[333.0, 222.0], [301.0, 244.0]], dtype=torch.float64)
+        for method in ("ml", "lanz"):
+            pattern = barrel(coefficients=(0.0, 0.0, 0.0), draws=2)
+            fit = estimate(pattern, method=method, center=start)
+            assert fit.status == [Status.CENTER_UNOBSERVABLE] * 2
+            assert torch.equal(fit.lens.center, start)
+
+
+class TestOptions:
     def test_pixels_that_are_not_square_need_their_aspect(self):
         lens = synthetic.lens((0.03, 0.1, 0.02), pixel_aspect=0.87)
         pattern = synthetic.pattern_of(lens, points=15)
         truth = synthetic.truth_of(lens)
         told = estimate(pattern, pixel_aspect=0.87)
-        assert synthetic.largest_error(told.lens, truth, similarity=False) < 1e-3
-        assert told.rms_px < 1e-4
+        assert synthetic.largest_error(told.lens, truth, similarity=False) < 1e-6
+        assert told.rms_px < 1e-9
         blind = estimate(pattern)
         assert synthetic.largest_error(blind.lens, truth, similarity=True) > 1.0
         assert blind.rms_px > 0.05
@@ -129,22 +329,27 @@ class TestOptions:
         lenses = [synthetic.lens(pixel_aspect=aspect) for aspect in (0.87, 1.0)]
         patterns = LinePatterns.stack([synthetic.pattern_of(one, points=12) for one in lenses])
         fit = estimate(patterns, pixel_aspect=synthetic.double(0.87, 1.0))
-        assert fit.rms_px.max() < 1e-4
+        assert fit.rms_px.max() < 1e-9
 
     def test_l0_may_be_held(self):
-        held = estimate(barrel(), free_l0=False, max_iterations=30)
+        held = estimate(barrel(), method="lanz", free_l0=False, max_iterations=30)
         assert held.iterations == 30
         assert held.status == [Status.NOT_CONVERGED]
 
     def test_a_variance_threshold_stops_early(self):
-        early = estimate(barrel(), variance_threshold=0.5)
-        assert early.iterations < estimate(barrel()).iterations
+        early = estimate(barrel(), method="lanz", variance_threshold=0.5)
+        assert early.iterations < estimate(barrel(), method="lanz").iterations
         assert early.rms_px > 0.11
+
+    def test_those_of_the_loop_are_nothing_to_ml(self):
+        plain = estimate(barrel())
+        told = estimate(barrel(), free_l0=False, max_iterations=1, variance_threshold=1e3)
+        assert torch.equal(parameters(plain), parameters(told))
 
 
 class TestErrors:
     def test_an_unknown_method_is_named(self):
-        with pytest.raises(ValueError, match=r"unknown method 'magic'.*lanz"):
+        with pytest.raises(ValueError, match=r"unknown method 'magic'.*ml, lanz"):
             estimate(barrel(), method="magic")
 
     @pytest.mark.parametrize("powers", [(), (0, 1), (-1, 2), (2, 1), (1, 1), ((1, 2),)])
@@ -152,11 +357,16 @@ class TestErrors:
         with pytest.raises(ValueError, match="powers must be"):
             estimate(barrel(), powers=powers)
 
+    @pytest.mark.parametrize(("powers", "method"), [("many", "ml"), ("auto", "lanz")])
+    def test_words_for_powers_are_told(self, powers, method):
+        with pytest.raises(ValueError, match=f"auto.*{powers}"):
+            estimate(barrel(), powers=powers, method=method)
+
 
 class TestNumbers:
     def test_float32_is_estimated_in_float64(self):
         exact = barrel()
-        short = LinePatterns(exact.points.float(), exact.mask, exact.image_size.float())
+        short = replace(exact, points=exact.points.float(), image_size=exact.image_size.float())
         fit = estimate(short)
         assert fit.lens.center.dtype == fit.covariance.dtype == fit.rms_px.dtype == torch.float64
         torch.testing.assert_close(fit.lens.center, estimate(exact).lens.center, atol=1e-2, rtol=0)
@@ -175,62 +385,22 @@ class TestNumbers:
         torch.testing.assert_close(there.lens.center.cpu(), here.lens.center, atol=1e-3, rtol=0)
         torch.testing.assert_close(there.gain.cpu(), here.gain, atol=1e-5, rtol=0)
 
-
-def mixed_batch():
-    """Good, weak, degenerate, undistorted, short and broken items together."""
-    radial = [
-        [319.5, 239.5] + np.linspace(-200, 200, 11)[:, None] * [np.cos(turn), np.sin(turn)]
-        for turn in np.pi * np.arange(6) / 6
-    ]
-    one_place = [np.full((5, 2), 100.0)] * 4
-    items = [
-        barrel(),
-        barrel(coefficients=(-0.1, 0.02, 0.0), seed=3),
-        synthetic.stacked(radial),
-        barrel(coefficients=(0.0, 0.0, 0.0), seed=4),
-        synthetic.stacked(one_place),
-        barrel(points=3),
-        barrel(coefficients=(0.005, 0.0, 0.0), seed=5),
-    ]
-    return LinePatterns.stack(items)
-
-
-class TestItems:
-    @pytest.mark.parametrize("offsets", [False, True])
-    def test_each_is_what_it_would_be_alone(self, offsets):
-        patterns = mixed_batch()
-        if offsets:
-            generator = torch.Generator().manual_seed(7)
-            size = torch.randn(patterns.points.shape, generator=generator, dtype=torch.float64)
-            patterns = LinePatterns(
-                patterns.points, patterns.mask, patterns.image_size, offsets=0.5 * size
-            )
-        together = estimate(patterns, max_iterations=60)
-        for i in range(len(patterns)):
-            alone = estimate(patterns[i : i + 1], max_iterations=60)
-            assert together.status[i] == alone.status[0]
-            if alone.status[0] not in (Status.OK, Status.CENTER_UNOBSERVABLE):
-                continue  # nothing is claimed of the numbers of a failed item
-            for name in ("rms_px", "residuals", "covariance", "gain"):
-                if getattr(alone, name) is None:
-                    continue
-                a, b = getattr(together, name)[i].abs(), getattr(alone, name)[0].abs()
-                torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
-            torch.testing.assert_close(
-                together.lens.center[i], alone.lens.center[0], rtol=0, atol=1e-5
-            )
-            torch.testing.assert_close(
-                together.lens.coefficients[i], alone.lens.coefficients[0], rtol=0, atol=1e-7
-            )
-
-    def test_points_that_are_not_numbers_spoil_their_item_alone(self):
-        good = barrel()
-        points = torch.cat([good.points, good.points])
-        points[0, 2, 3, 0] = float("nan")
-        both = LinePatterns(points, good.mask.repeat(2, 1, 1), good.image_size.repeat(2, 1))
-        fit = estimate(both)
-        assert fit.status[0] != Status.OK
-        assert fit.status[1] == Status.OK
-        torch.testing.assert_close(
-            fit.lens.center[1], estimate(good).lens.center[0], atol=1e-5, rtol=0
-        )
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+    @pytest.mark.parametrize("robust", [True, False])
+    def test_points_that_are_none_are_set_aside(self, bad, robust):
+        good = barrel(draws=2)
+        points, offsets = good.points.clone(), torch.zeros_like(good.points)
+        points[0, 2, 3, 0] = bad
+        points[0, 7] = bad
+        fit = estimate(replace(good, points=points), robust=robust)
+        gone = torch.zeros_like(good.mask)
+        gone[0, 2, 3], gone[0, 7] = True, True
+        assert fit.status == [Status.OK] * 2
+        assert torch.equal(fit.inliers, ~gone)
+        assert fit.residuals.isfinite().all()
+        without = estimate(replace(good, mask=~gone), robust=robust)
+        torch.testing.assert_close(parameters(fit), parameters(without), atol=1e-9, rtol=0)
+        offsets[0, 2, 3] = bad
+        told = estimate(replace(good, offsets=offsets), robust=robust)
+        assert not told.inliers[0, 2, 3]
+        assert told.status == [Status.OK] * 2

@@ -102,6 +102,48 @@ class TestWeights:
         assert problem.using(inliers).using(problem.mask).line_count.tolist() == [13, 13]
 
 
+class TestKnown:
+    def test_gains_of_offsets_that_are_all_zero_are_not(self):
+        offsets = torch.zeros(2, 14, 9, 2, dtype=torch.float64)
+        offsets[1, 3, 4, 0] = 0.5
+        for per_axis, expected in [
+            (False, [[False], [True]]),
+            (True, [[False, False], [True, False]]),
+        ]:
+            problem = Problem.from_patterns(pattern_of(offsets=offsets), POWERS, 1.0, per_axis)
+            assert problem.known[:, :5].all()
+            assert problem.known[:, 5:].tolist() == expected
+        inliers = problem.mask.clone()
+        inliers[1, 3, 4] = False
+        assert not problem.using(inliers).known[:, 5:].any()
+
+    def test_all_the_rest_is(self):
+        assert Problem.from_patterns(pattern_of(), POWERS).known.tolist() == [[True] * 5] * 2
+
+
+class TestTrimmed:
+    def test_loses_padding_of_all_items_and_nothing_else(self):
+        pattern = pattern_of(offsets=ones(2, 14, 9, 2))
+        mask = pattern.mask.clone()
+        mask[:, 12:], mask[:, :, 7:] = False, False
+        mask[0, 11], mask[1, 5, 6] = False, False
+        problem = Problem.from_patterns(
+            LinePatterns(pattern.points, mask, pattern.image_size, pattern.offsets), POWERS
+        )
+        inliers = problem.mask.clone()
+        inliers[:, 11] = False  # set aside is not padding
+        trimmed = problem.using(inliers).trimmed()
+        for name in ("points", "mask", "weight", "offsets"):
+            expected = getattr(problem.using(inliers), name)[:, :12, :7]
+            assert torch.equal(getattr(trimmed, name), expected)
+
+    def test_without_points_it_stays(self):
+        pattern = pattern_of()
+        pattern.mask[:] = False
+        problem = Problem.from_patterns(pattern, POWERS)
+        assert problem.trimmed().mask.shape == problem.mask.shape
+
+
 class TestBasis:
     @pytest.mark.parametrize(
         "powers", [(1, 2, 3), (2, 4, 6), (1, 2, 3, 4, 5), (0.5, 1.5, 3), (2.5, 40), (20,)]

@@ -12,6 +12,7 @@ from torchptz.batch import Batched
 from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.implicit import differentiable
 from torchptz.estimation.maximum_likelihood import maximise
+from torchptz.estimation.misfit import inflation
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined, refine, settle_lines
 from torchptz.estimation.residuals import State, split, straightness
@@ -170,64 +171,61 @@ def _loop(
 
 
 def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: Solution) -> Fit:
-    state, known, free = solution.refined.state, solution.known, solution.free
-    with torch.no_grad():
-        covariance = known.covariance
-        prior = search.prior(problem)
-        if prior is not None:
-            covariance = with_prior(known, free, prior)
-        assumed = search.covariance
-        if assumed is None:
-            identity = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
-            assumed = (_VAGUE_CENTER * problem.image_size[:, :1, None]) ** 2 * identity
-        held = with_center_held(known, covariance, assumed)
-        covariance = torch.where(solution.held[:, None, None], held, covariance)
-        systematic = None
-        if patterns.systematic is not None:
-            systematic = systematic_covariance(problem, state, free, patterns.systematic.double())
-    rms = known.rms
-    if problem.points.requires_grad or (
-        problem.offsets is not None and problem.offsets.requires_grad
-    ):
-        state = differentiable(problem, state, free, prior)
-        rms = rms_of(problem, state, free)
-    center, coefficients, gain = split(problem, state.theta)
-    lens = RadialLens(
-        center,
-        coefficients,
-        problem.powers,
-        problem.scale,
-        problem.image_size,
-        problem.pixel_aspect,
-    )
+    state, free, prior = solution.refined.state, solution.free, search.prior(problem)
+    rms = solution.known.rms
     size = 2 + len(problem.powers)
-    gain_sigma = None
-    if gain is not None:
-        gain_sigma = covariance[:, size:, size:].diagonal(dim1=1, dim2=2).sqrt()
-        gain_sigma = torch.where(free[:, size:], gain_sigma, GAIN_SIGMA)
-        if not problem.gain_per_axis:
-            gain, gain_sigma = gain[:, 0], gain_sigma[:, 0]
-    covariance = covariance[:, :size, :size]
     with torch.no_grad():
+        covariance = _covariance(problem, search, solution, prior)
+        grown = inflation(problem, state, free, rms, covariance[:, :size, :size])
+        grown = torch.where(solution.held, 1.0, grown)[:, None, None]
+        lens = problem.lens(*split(problem, state.theta)[:2])
         status = judge(
             problem,
             lens,
-            covariance,
+            covariance[:, :size, :size],
             unknowns=free.sum(-1) + 2 * solution.held,
             converged=solution.refined.converged,
             held=solution.held,
             outlying=solution.outlying,
             misfit=solution.misfit,
         )
+        systematic = None
+        if patterns.systematic is not None:
+            systematic = systematic_covariance(problem, state, free, patterns.systematic.double())
+            systematic = systematic[:, :size, :size]
+    if any(one is not None and one.requires_grad for one in (problem.points, problem.offsets)):
+        state = differentiable(problem, state, free, prior)
+        rms = rms_of(problem, state, free)
+    center, coefficients, gain = split(problem, state.theta)
+    gain_sigma = None
+    if gain is not None:
+        gain_sigma = (grown * covariance)[:, size:, size:].diagonal(dim1=1, dim2=2).sqrt()
+        gain_sigma = torch.where(free[:, size:], gain_sigma, GAIN_SIGMA)
+        if not problem.gain_per_axis:
+            gain, gain_sigma = gain[:, 0], gain_sigma[:, 0]
     return Fit(
-        lens=lens,
+        lens=problem.lens(center, coefficients),
         rms_px=rms,
         residuals=straightness(problem, state),
         inliers=problem.weight > 0,
         iterations=solution.refined.iterations,
-        covariance=covariance,
-        systematic_covariance=None if systematic is None else systematic[:, :size, :size],
+        covariance=(grown * covariance)[:, :size, :size],
+        systematic_covariance=systematic,
         gain=gain,
         gain_sigma=gain_sigma,
         status=status,
     )
+
+
+def _covariance(
+    problem: Problem, search: Search, solution: Solution, prior: Prior | None
+) -> Tensor:
+    """(B, M, M) of theta, for powers that can follow the lens."""
+    known = solution.known
+    covariance = known.covariance if prior is None else with_prior(known, solution.free, prior)
+    assumed = search.covariance
+    if assumed is None:
+        identity = torch.eye(2, dtype=covariance.dtype, device=covariance.device)
+        assumed = (_VAGUE_CENTER * problem.image_size[:, :1, None]) ** 2 * identity
+    held = with_center_held(known, covariance, assumed)
+    return torch.where(solution.held[:, None, None], held, covariance)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 
 _MOST_FACTORS = 8
@@ -107,6 +108,12 @@ class Problem(Batched):
     def with_data(self, points: Tensor, offsets: Tensor | None) -> Problem:
         """The same problem with other points (B, L, P, 2) and offsets alike, px."""
         return replace(self, points=points, offsets=offsets)
+
+    def lens(self, center: Tensor, coefficients: Tensor) -> RadialLens:
+        """The lens of centres (B, 2) px and coefficients (B, K)."""
+        return RadialLens(
+            center, coefficients, self.powers, self.scale, self.image_size, self.pixel_aspect
+        )
 
     @property
     def middle(self) -> Tensor:

@@ -96,12 +96,17 @@ def border_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
     taken. Inf where it is not known."""
     share = torch.tensor([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1)], dtype=torch.float64)
     border = share.to(lens.center) * lens.image_size[:, None] - 0.5
+    # Beyond a fold there is no picture: as far as it goes.
+    away = border - lens.center[:, None]
+    distance = (lens.radius(border) * lens.scale[:, None]).clamp_min(1e-9)
+    reach = (0.99 * lens.valid_radius[:, None] / distance).clamp(max=1.0)
+    border = lens.center[:, None] + reach[..., None] * away
     sigma = lens.displacement_sigma(border, covariance, part="lines")
-    stretch = torch.linalg.vector_norm(lens.undistort(border) - lens.center[:, None], dim=-1)
-    stretch = stretch / torch.linalg.vector_norm(border - lens.center[:, None], dim=-1)
-    sigma = sigma / stretch.clamp_min(1.0)
-    # Beyond a fold there is no picture; that is another failure.
-    return torch.where(sigma.isnan(), 0.0, sigma).amax(-1)
+    moved = lens.undistort(border) - lens.center[:, None]
+    stretch = torch.linalg.vector_norm(moved, dim=-1) / (
+        torch.linalg.vector_norm(border - lens.center[:, None], dim=-1).clamp_min(1e-9)
+    )
+    return (sigma / stretch.clamp_min(1.0)).amax(-1)
 
 
 def judge(
@@ -138,11 +143,11 @@ def judge(
             outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
         ),
         (Status.TOO_FEW_LINES, too_few(problem.weight > 0, unknowns)),
+        (Status.MISFIT, misfit),
         (
             Status.DISTORTION_UNOBSERVABLE,
             ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),
         ),
-        (Status.MISFIT, misfit),
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
         (Status.CENTER_UNOBSERVABLE, held),
