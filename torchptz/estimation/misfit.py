@@ -59,7 +59,7 @@ def inflation(
     clear = (linear.right * step).sum(-1) > bound * rms**2
 
     lens = rich.lens(*split(rich, at.theta)[:2])
-    axes = [(torch.arange(n, dtype=torch.float64) / (n - 1)).to(center.device) for n in _GRID]
+    axes = [(torch.arange(n, dtype=torch.float64) / (n - 1)).to(lens.center.device) for n in _GRID]
     grid = torch.cartesian_prod(*axes) * lens.image_size[:, None] - 0.5
     inside = lens.is_valid(grid)
     known = step[:, : 2 + len(rich.powers)]
