@@ -35,7 +35,7 @@ def displacement_sigma(
             f"covariance must have shape {(batch, count, count)}, not {tuple(covariance.shape)}"
         )
     inside = lens.is_valid(points)
-    flat = points.reshape(len(points), -1, 2)
+    flat = points.reshape(len(points), math.prod(points.shape[1:-1]), 2)
     jacobian = undistort_jacobian(lens, flat)
     if part != "all":
         fitted = _times(homography_fields(lens, flat), _homography_of_errors(lens))

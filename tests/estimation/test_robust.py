@@ -152,7 +152,7 @@ class TestOutliers:
 class TestTooMany:
     @pytest.mark.parametrize("share", [0.6, 0.8])
     def test_are_told(self, share):
-        spoilt, _ = synthetic.with_gross_errors(clean(draws=3, points=25), share)
+        spoilt, _ = synthetic.with_gross_errors(clean(draws=2, points=25), share)
         assert set(estimate(spoilt).status) == {Status.OUTLIERS}
 
     def test_noise_that_is_no_noise_is_told(self):

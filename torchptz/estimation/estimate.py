@@ -96,7 +96,8 @@ def estimate(
         implicit function theorem at the optimum, for the inliers and powers as found.
 
     Raises:
-        ValueError: unknown method, powers that are neither positive and increasing nor "auto".
+        ValueError: unknown method, powers that are neither positive and increasing nor "auto",
+            values of the wrong shape, a covariance that is not positive definite.
 
     Source: paper, section 2; "ml" and offsets: README, "Beyond the paper".
     """
@@ -125,16 +126,31 @@ def estimate(
         return _as_fit(replace(problem, weight=used.weight), patterns, search, solution)
 
     size = patterns.image_size.double()
-    start = ((size - 1) / 2 if center is None else center.to(size)).expand_as(size)
-    if center_covariance is not None and method == "ml":
-        center_covariance = center_covariance.to(size).expand(len(size), 2, 2)
-    else:
-        center_covariance = None
-    search = Search(start, start, center_covariance)
-    aspect = torch.as_tensor(pixel_aspect, dtype=size.dtype, device=size.device).expand(len(size))
+
+    def per_item(value: object, name: str, *tail: int) -> Tensor:
+        tensor = torch.as_tensor(value, dtype=size.dtype, device=size.device)
+        if tensor.shape not in {tail, (1, *tail), (len(size), *tail)}:
+            raise ValueError(
+                f"{name} must have shape {(len(size), *tail)}, not {tuple(tensor.shape)}"
+            )
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"{name} must be finite")
+        return tensor.expand(len(size), *tail)
+
+    start = per_item((size - 1) / 2 if center is None else center, "center", 2)
+    if center_covariance is not None:
+        center_covariance = per_item(center_covariance, "center_covariance", 2, 2)
+        singular = torch.linalg.cholesky_ex(center_covariance).info > 0
+        if bool(singular.any()):
+            first = int(singular.nonzero()[0])
+            raise ValueError(f"center_covariance of item {first} is not positive definite")
+    search = Search(start, start, center_covariance if method == "ml" else None)
+    aspect = per_item(pixel_aspect, "pixel_aspect")
+    if not bool((aspect > 0).all()):
+        raise ValueError("pixel_aspect must be positive")
     # Not all at once: what does not fit the caches is slow, and what does not fit the memory fails.
-    step = max(1, _CHUNK // max(1, patterns.mask[0].numel()))
-    parts = [slice(begun, begun + step) for begun in range(0, len(patterns), step)]
+    step = max(1, _CHUNK // max(1, patterns.mask.shape[1:].numel()))
+    parts = [slice(begun, begun + step) for begun in range(0, max(1, len(patterns)), step)]
     return Fit.cat([fit(patterns[part], aspect[part], search[part]) for part in parts])
 
 
