@@ -150,6 +150,19 @@ class TestResult:
         assert knowing < 1.0
         assert blind > 4 * knowing
 
+    @pytest.mark.parametrize("powers", [(1, 2, 3), (2, 4)])
+    def test_what_the_powers_leave_out_is_in_the_covariance(self, powers):
+        # The lines are nearly straight with either; the corners are off by 10 px and 20 px.
+        lens = synthetic.lens((0.0, 0.03), powers=(2, 6))
+        pattern = synthetic.noisy(synthetic.pattern_of(lens, points=35), 0.1, draws=4)
+        fit = estimate(pattern, powers=powers, robust=False)
+        corners = torch.tensor([[[0.0, 0.0], [639.0, 479.0], [0.0, 479.0]]], dtype=torch.float64)
+        off = torch.linalg.vector_norm(
+            fit.lens.undistort(corners) - lens.undistort(corners), dim=-1
+        )
+        assert (off.amax(-1) > 5).all()
+        assert (off < 3 * fit.lens.displacement_sigma(corners, fit.covariance)).all()
+
     def test_systematic_errors_of_the_patterns_are_told_apart(self):
         pattern = barrel()
         away = (pattern.points - MIDDLE) / 320

@@ -289,9 +289,11 @@ class TestPrior:
         np.testing.assert_allclose(result.state.theta[0, :2], solved.x[:2], atol=1e-4)
         apart = prior.value(result.state.theta)
         assert noise**2 * float(apart) + cost == pytest.approx(2 * solved.cost, rel=1e-9)
-        # It pulls, and not all the way.
-        plain = refined(problem, START[:, :5]).state.theta[0, :2]
-        assert 0.1 < apart < float(prior.value(torch.cat([plain, torch.zeros(3)])[None]))
+        # It pulls, and not all the way, up from the bottom of the cost too.
+        plain = refined(problem, START[:, :5]).state.theta
+        assert 0.1 < apart < prior.value(plain)
+        again = refined(problem, plain, prior=prior).state.theta
+        torch.testing.assert_close(again[:, :2], result.state.theta[:, :2], atol=1e-6, rtol=0)
 
     def test_nothing_known_changes_nothing(self):
         problem = problem_of(pattern_of())

@@ -126,9 +126,9 @@ class TestOutliers:
         torch.testing.assert_close(fit.rms_px, (squares / freedom).sqrt())
 
     def test_without_distortion_too(self):
-        spoilt, wrong = synthetic.with_gross_errors(clean(synthetic.lens((0, 0, 0))), 0.2)
+        spoilt, wrong = synthetic.with_gross_errors(clean(synthetic.lens((0, 0, 0)), draws=3), 0.2)
         fit = estimate(spoilt)
-        assert fit.status == [Status.CENTER_UNOBSERVABLE] * DRAWS
+        assert fit.status == [Status.CENTER_UNOBSERVABLE] * 3
         assert not (fit.inliers & wrong).any()
         assert (fit.inliers | wrong).double().mean() > 0.98
 
@@ -150,9 +150,8 @@ class TestOutliers:
 
 
 class TestTooMany:
-    @pytest.mark.parametrize("share", [0.6, 0.8])
-    def test_are_told(self, share):
-        spoilt, _ = synthetic.with_gross_errors(clean(draws=2, points=25), share)
+    def test_are_told(self):
+        spoilt, _ = synthetic.with_gross_errors(clean(draws=2, points=25), 0.65)
         assert set(estimate(spoilt).status) == {Status.OUTLIERS}
 
     def test_noise_that_is_no_noise_is_told(self):
@@ -196,7 +195,7 @@ class TestFindInliers:
     def test_each_item_is_what_it_is_alone(self):
         gross, _ = synthetic.with_gross_errors(clean(draws=1), 0.2)
         lines, _ = with_wrong_lines(clean(LENSES["strong barrel"], draws=1, points=25), 2)
-        many, _ = synthetic.with_gross_errors(clean(draws=1, points=20), 0.7)
+        many, _ = synthetic.with_gross_errors(clean(draws=1, points=12), 0.7)
         batch = LinePatterns.stack([gross, many, lines])
         together = self.found(batch)
         for i in range(3):
@@ -222,6 +221,16 @@ class TestSuspicious:
 
     def test_wrong_lines_are(self):
         assert self.judged(with_wrong_lines(clean(), 1, size=3.0)[0]).all()
+
+    def test_a_rough_line_is_though_none_of_its_points_is_far_off(self):
+        problem = problem_of(clean(draws=1))
+        generator = torch.Generator().manual_seed(2)
+        residual = SIGMA * torch.randn(1, 14, 35, generator=generator, dtype=torch.float64)
+        residual = residual.clamp(-3 * SIGMA, 3 * SIGMA)
+        freedom = torch.tensor([14 * 33 - 5])
+        assert not suspicious(problem, residual, freedom).any()
+        residual[:, 4] = 2.5 * SIGMA * (-1.0) ** torch.arange(35)
+        assert suspicious(problem, residual, freedom).all()
 
     def test_a_fit_that_smoothed_everything_over_is(self):
         # Gross errors everywhere: none of the residuals stands out.

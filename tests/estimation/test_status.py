@@ -46,7 +46,7 @@ def one_corner():
 
 
 def ridden():
-    return synthetic.with_gross_errors(barrel(points=25), 0.7)[0]
+    return synthetic.with_gross_errors(barrel(points=20), 0.7)[0]
 
 
 def other_powers():

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
-from torchptz.estimation.center import center_step
+from torchptz.estimation.center import center_step, idle
 from torchptz.estimation.coefficients import solve_coefficients
 from torchptz.estimation.lines import fit_lines
 from torchptz.estimation.problem import Problem
@@ -178,7 +178,7 @@ def _advance(
             if stop.variance_threshold is not None:
                 done = active & (variances.nanmean(-1) < stop.variance_threshold)
                 converged, active = converged | done, active & ~done
-        if not active.any():
+        if idle(active):
             break
         moved, solved = fixed_point_step(problem, center, coefficients, gain, hold_center, free_l0)
         # A blown-up item keeps its last good state and stops alone; the SVDs of the others never

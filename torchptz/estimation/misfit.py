@@ -50,13 +50,15 @@ def inflation(
     size = normal.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
     normal = normal / (size[:, :, None] * size[:, None])
     ridge = 1e-12 * torch.eye(normal.shape[-1]).to(normal)
-    right = (linear.right * unit / size).unsqueeze(-1)
+    # At the optimum the gradient along the parameters that it has is zero, or a prior's pull.
+    score = torch.where(base, 0.0, linear.right)
+    right = (score * unit / size).unsqueeze(-1)
     step = (torch.linalg.solve_ex(normal + ridge, right).result.squeeze(-1) * unit) / size
     # Chi-squared, by Wilson and Hilferty's approximation.
     more = (~base).sum(-1)
     spread = (2 / (9 * more.clamp_min(1))).sqrt()
     bound = more * (1 - spread**2 + _CLEAR * spread) ** 3
-    clear = (linear.right * step).sum(-1) > bound * rms**2
+    clear = (score * step).sum(-1) > bound * rms**2
 
     lens = rich.lens(*split(rich, at.theta)[:2])
     axes = [(torch.arange(n, dtype=torch.float64) / (n - 1)).to(lens.center.device) for n in _GRID]
