@@ -26,7 +26,9 @@ CANDIDATES = ((1.0, 2.0, 3.0), (2.0, 4.0, 6.0), (1.0, 2.0, 3.0, 4.0), (1.0, 2.0,
 UNION = tuple(sorted(set().union(*CANDIDATES)))
 
 _FOLDS = 4
-_STANDARD_ERRORS = 1.0
+# Differences below so many standard errors are none. Half of the usual one: held-out lines have
+# little to choose between powers that differ where no line passes.
+_STANDARD_ERRORS = 0.5
 
 
 def choose_powers(problem: Problem, search: Search, solver: Solver) -> Tensor:
@@ -44,7 +46,7 @@ def choose_powers(problem: Problem, search: Search, solver: Solver) -> Tensor:
     Returns:
         (B,) index into `CANDIDATES`.
 
-    Source: cross-validation with the one standard error rule (Breiman et al. 1984).
+    Source: cross-validation with a standard error rule (Breiman et al. 1984).
     """
     scores = torch.stack(
         [_held_out(problem.with_powers(powers), search, solver) for powers in CANDIDATES]
