@@ -107,7 +107,11 @@ def _homography_of_errors(lens: RadialLens) -> Tensor:
     inside = lens.is_valid(grid)[..., None, None]
     fields = torch.where(inside, homography_fields(lens, grid), 0.0).flatten(1, 2)
     errors = torch.where(inside, undistort_jacobian(lens, grid), 0.0).flatten(1, 2)
+    # One matrix that is not finite makes the decomposition of the whole batch raise.
+    finite = (fields.isfinite().all((1, 2)) & errors.isfinite().all((1, 2)))[:, None, None]
+    fields, errors = torch.where(finite, fields, 0.0), torch.where(finite, errors, math.nan)
     normal = fields.transpose(1, 2) @ fields
+    normal = torch.where(normal.isfinite().all((1, 2), keepdim=True), normal, 0.0)
     return torch.linalg.pinv(normal, hermitian=True) @ (fields.transpose(1, 2) @ errors)
 
 

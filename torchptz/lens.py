@@ -20,6 +20,7 @@ from torchptz.radial import RadialFunction
 
 SCHEMA = "torchptz.lens"
 SCHEMA_VERSION = 1
+_HIGHEST_POWER = 50.0  # beyond it, r to that power is a number for no picture
 
 
 def checked_powers(powers: Sequence[float] | Tensor) -> Tensor:
@@ -33,6 +34,8 @@ def checked_powers(powers: Sequence[float] | Tensor) -> Tensor:
         raise ValueError(f"powers must be a list of at least one number, not {powers}")
     if not bool((checked > 0).all() and (checked.diff() > 0).all()):
         raise ValueError(f"powers must be positive and increasing numbers, not {powers}")
+    if not bool((checked <= _HIGHEST_POWER).all()):
+        raise ValueError(f"powers must be at most {_HIGHEST_POWER:g}, not {powers}")
     return checked
 
 

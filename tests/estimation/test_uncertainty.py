@@ -285,6 +285,12 @@ class TestWithCenterHeld:
         assert got[0, 2:, 2:].diagonal().isinf().all()
 
 
+def systematic(problem, state, free, displacements):
+    """(B, M, M) of an estimate that no prior had a part in."""
+    known = from_residuals(problem, state, free)
+    return systematic_covariance(problem, state, known, free, None, displacements)
+
+
 class TestSystematic:
     def displacements(self, pattern):
         """Of two errors: one turns the picture's left half, one bends every line a little."""
@@ -301,7 +307,7 @@ class TestSystematic:
         problem = problem_of(pattern)
         center = LENS.center if held else None
         state, free = solved(problem, held, center)
-        got = systematic_covariance(problem, state, free, displacements)
+        got = systematic(problem, state, free, displacements)
         changes = []
         for one in displacements.unbind(-1):
             moved = [
@@ -332,8 +338,8 @@ class TestSystematic:
         problem = problem_of(pattern)
         state, free = solved(problem)
         displacements = self.displacements(pattern)
-        one = systematic_covariance(problem, state, free, displacements)
-        two = systematic_covariance(problem, state, free, 2 * displacements)
+        one = systematic(problem, state, free, displacements)
+        two = systematic(problem, state, free, 2 * displacements)
         torch.testing.assert_close(two, 4 * one)
         assert torch.linalg.matrix_rank(one[0] / one[0].diagonal().sqrt()[:, None]) <= 2
 
@@ -345,9 +351,9 @@ class TestSystematic:
         problem = problem.using(inliers)
         state, free = solved(problem)
         displacements = self.displacements(pattern)
-        one = systematic_covariance(problem, state, free, displacements)
+        one = systematic(problem, state, free, displacements)
         displacements[~inliers] = 1e6
-        assert torch.equal(systematic_covariance(problem, state, free, displacements), one)
+        assert torch.equal(systematic(problem, state, free, displacements), one)
 
     def test_what_refitting_lines_takes_up_counts_for_nothing(self):
         pattern = synthetic.noisy(synthetic.pattern_of(LENS, points=12), 0.02)
@@ -355,6 +361,24 @@ class TestSystematic:
         state, free = solved(problem)
         normal = torch.stack([state.angle.cos(), state.angle.sin()], -1)[:, :, None]
         shifted = 5 * normal.expand_as(pattern.points).unsqueeze(-1)
-        got = systematic_covariance(problem, state, free, shifted)
+        got = systematic(problem, state, free, shifted)
         own = from_residuals(problem, state, free).covariance
         assert (got.diagonal(dim1=1, dim2=2) < 1e-12 * own.diagonal(dim1=1, dim2=2)).all()
+
+    def test_a_prior_on_the_centre_holds_against_it(self):
+        weak = synthetic.lens((0.002, 0.006, 0.001))
+        pattern = synthetic.noisy(synthetic.pattern_of(weak, points=12, border=8.0), 0.1)
+        one = self.displacements(pattern)[..., :1]
+        known = {"center": weak.center, "center_covariance": 25 * torch.eye(2).double()}
+        fit = estimate(replace(pattern, systematic=one), robust=False, **known)
+        moved = [
+            estimate(
+                replace(pattern, points=pattern.points + sign * 0.1 * one[..., 0]),
+                robust=False,
+                **known,
+            ).lens
+            for sign in (1, -1)
+        ]
+        change = (moved[0].center - moved[1].center)[0] / 0.2
+        got = fit.systematic_covariance[0, :2, :2].diagonal().sqrt()
+        torch.testing.assert_close(got, change.abs(), rtol=0.1, atol=0.02)

@@ -16,7 +16,7 @@ from torchptz.estimation.misfit import inflation
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined, refine, settle_lines
 from torchptz.estimation.residuals import State, split, straightness
-from torchptz.estimation.selection import UNION, solve_with_best_powers
+from torchptz.estimation.selection import CANDIDATES, UNION, solve_with_best_powers
 from torchptz.estimation.solution import GAIN_SIGMA, Search, Solution, solve, solve_robustly
 from torchptz.estimation.status import Status, judge
 from torchptz.estimation.uncertainty import (
@@ -93,7 +93,8 @@ def estimate(
     Returns:
         Fit. Items are independent: a bad one gets its own status and changes no other's numbers.
         Where points or offsets require gradients, lens, gain, residuals and rms carry them, by the
-        implicit function theorem at the optimum, for the inliers and powers as found.
+        implicit function theorem at the optimum, for the inliers and powers as found ("ml" only,
+        first derivatives only).
 
     Raises:
         ValueError: unknown method, powers that are neither positive and increasing nor "auto",
@@ -103,6 +104,10 @@ def estimate(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
+    if method == "lanz" and patterns.points.requires_grad:
+        raise ValueError(
+            'gradients are those of the optimum that method "ml" finds; detach the points'
+        )
     choose = isinstance(powers, str)
     if choose and (powers != "auto" or method != "ml"):
         raise ValueError(f'powers are numbers, or "auto" with method "ml", not {powers!r}')
@@ -123,7 +128,8 @@ def estimate(
             else:
                 used, solution = problem, solve(problem, search, solver)
         # The problem itself: it knows the points' gradients.
-        return _as_fit(replace(problem, weight=used.weight), patterns, search, solution)
+        problem = replace(problem, weight=used.weight)
+        return _as_fit(problem, patterns, search, solution, method == "ml")
 
     size = patterns.image_size.double()
 
@@ -141,15 +147,19 @@ def estimate(
     if center_covariance is not None:
         center_covariance = per_item(center_covariance, "center_covariance", 2, 2)
         singular = torch.linalg.cholesky_ex(center_covariance).info > 0
+        singular |= center_covariance[:, 0, 1] != center_covariance[:, 1, 0]
         if bool(singular.any()):
             first = int(singular.nonzero()[0])
-            raise ValueError(f"center_covariance of item {first} is not positive definite")
+            raise ValueError(
+                f"center_covariance of item {first} is not symmetric and positive definite"
+            )
     search = Search(start, start, center_covariance if method == "ml" else None)
     aspect = per_item(pixel_aspect, "pixel_aspect")
     if not bool((aspect > 0).all()):
         raise ValueError("pixel_aspect must be positive")
     # Not all at once: what does not fit the caches is slow, and what does not fit the memory fails.
-    step = max(1, _CHUNK // max(1, patterns.mask.shape[1:].numel()))
+    most = _CHUNK // (len(CANDIDATES) if choose else 1)
+    step = max(1, most // max(1, patterns.mask.shape[1:].numel()))
     parts = [slice(begun, begun + step) for begun in range(0, max(1, len(patterns)), step)]
     return Fit.cat([fit(patterns[part], aspect[part], search[part]) for part in parts])
 
@@ -186,19 +196,27 @@ def _loop(
     return joint.where(offsets, plain)
 
 
-def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: Solution) -> Fit:
+def _as_fit(
+    problem: Problem,
+    patterns: LinePatterns,
+    search: Search,
+    solution: Solution,
+    most_likely: bool,
+) -> Fit:
     state, free, prior = solution.refined.state, solution.free, search.prior(problem)
     rms = solution.known.rms
     size = 2 + len(problem.powers)
     with torch.no_grad():
         covariance = _covariance(problem, search, solution, prior)
         grown = inflation(problem, state, free, rms, covariance[:, :size, :size])
-        grown = torch.where(solution.held, 1.0, grown)[:, None, None]
+        # What it asks for is known where the gradient is zero, and the centre was free.
+        grown = torch.where(solution.held | (not most_likely), 1.0, grown)[:, None, None]
         lens = problem.lens(*split(problem, state.theta)[:2])
         status = judge(
             problem,
             lens,
             covariance[:, :size, :size],
+            (grown * covariance)[:, :size, :size],
             unknowns=free.sum(-1) + 2 * solution.held,
             converged=solution.refined.converged,
             held=solution.held,
@@ -207,8 +225,9 @@ def _as_fit(problem: Problem, patterns: LinePatterns, search: Search, solution: 
         )
         systematic = None
         if patterns.systematic is not None:
-            systematic = systematic_covariance(problem, state, free, patterns.systematic.double())
-            systematic = systematic[:, :size, :size]
+            systematic = systematic_covariance(
+                problem, state, solution.known, free, prior, patterns.systematic.double()
+            )[:, :size, :size]
     if any(one is not None and one.requires_grad for one in (problem.points, problem.offsets)):
         state = differentiable(problem, state, free, prior)
         rms = rms_of(problem, state, free)

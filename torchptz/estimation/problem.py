@@ -14,6 +14,7 @@ from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 
 _MOST_FACTORS = 8
+_FEWEST_POINTS = 3  # of a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Problem(Batched):
     ) -> Problem:
         """In float64, whatever the patterns are in. Weights are 1/sigma² where sigmas are given.
 
-        Points that are not finite are left out.
+        Points that are not finite, or whose sigma is no number above 0, are left out.
         """
         points, offsets = patterns.points.double(), patterns.offsets
         mask = patterns.mask & points.isfinite().all(-1)
@@ -58,8 +59,9 @@ class Problem(Batched):
         weight = mask.double()
         if patterns.sigma is not None:
             sigma = patterns.sigma.double()
-            usable = mask & sigma.isfinite() & (sigma > 0)
-            weight = torch.where(usable, 1 / torch.where(usable, sigma, 1.0) ** 2, 0.0)
+            weight = 1 / torch.where(mask, sigma, 1.0) ** 2
+            mask = mask & weight.isfinite() & (weight > 0) & (sigma > 0)
+            weight = torch.where(mask, weight, 0.0)
         size = patterns.image_size.double()
         problem = cls(
             points=torch.where(mask.unsqueeze(-1), points, size[:, None, None] / 2),
@@ -80,6 +82,9 @@ class Problem(Batched):
     def using(self, inliers: Tensor) -> Problem:
         """The same problem with the points (B, L, P) bool only, weights renewed to mean 1."""
         weight = torch.where(inliers, self.weight, 0.0)
+        # Fewer points are straight whatever the lens, and cost degrees of freedom.
+        enough = (weight > 0).sum(-1, keepdim=True) >= _FEWEST_POINTS
+        weight = torch.where(enough, weight, 0.0)
         count = (weight > 0).sum((1, 2), keepdim=True)
         total = weight.sum((1, 2), keepdim=True)
         return replace(self, weight=weight * torch.where(total > 0, count / total, 0.0))

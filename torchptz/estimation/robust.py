@@ -151,12 +151,15 @@ def _settle(problem: Problem, state: State, started: Tensor) -> tuple[Tensor, St
     free = problem.known
     state = _redescend(problem, state, started)
     inliers = _within(problem, state, started)
+    settled = torch.zeros_like(inliers[:, 0, 0])
     for _ in range(_ROUNDS):
-        state = refine(problem.using(inliers), state, free).state
+        state = state.where(settled, refine(problem.using(inliers), state, free).state)
         following = _within(problem, state, inliers)
-        if torch.equal(following, inliers):
-            break
+        following = torch.where(settled[:, None, None], inliers, following)
+        settled = settled | (following == inliers).all((1, 2))
         inliers = following
+        if bool(settled.all()):
+            break
     return inliers, state
 
 

@@ -12,7 +12,7 @@ from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined
 from torchptz.estimation.residuals import straightness
-from torchptz.estimation.robust import find_inliers, suspicious
+from torchptz.estimation.robust import Inliers, find_inliers, suspicious
 from torchptz.estimation.status import MISFIT_LIMIT, center_unobservable
 from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 
@@ -20,6 +20,7 @@ from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 # head's readings are worth. Where poses leave the offsets next to no variation, as at the long end,
 # a free gain runs away and takes the lens along.
 GAIN_SIGMA = 0.3
+_CHUNK = 2**16  # points looked at for outliers at a time: many starts are tried of each
 
 # (problem, centre to start from, free parameters, prior) -> where the search ended
 Solver = Callable[[Problem, Tensor, Tensor, Prior | None], Refined]
@@ -106,7 +107,14 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
         return problem, solution
     # Not at the cost of the padding that other items need.
     items = problem[rows].trimmed()
-    inliers = find_inliers(items, search.start[rows])
+    inliers = Inliers.cat(
+        [
+            find_inliers(items[part], search.start[rows][part])
+            for part in torch.arange(len(rows), device=rows.device).split(
+                max(1, _CHUNK // max(1, items.mask.shape[1:].numel()))
+            )
+        ]
+    )
     _, lines, places = problem.mask.shape
     _, some_lines, some_places = items.mask.shape
     padding = (0, places - some_places, 0, lines - some_lines)

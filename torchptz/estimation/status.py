@@ -21,7 +21,9 @@ SEEN_LIMIT = 10.0
 BORDER_SIGMA_LIMIT = 0.01
 # Residuals so many times those that richer powers leave are the lens', not the points'.
 MISFIT_LIMIT = 1.4
-# With fewer inliers than this share of the points, others could pass for them.
+# A border that more powers would move by more than this part of the half width, neither.
+MISFIT_BORDER_LIMIT = 0.1
+# With fewer inliers than this share of the points, or of the lines, others could pass for them.
 INLIER_SHARE_LIMIT = 0.65
 
 
@@ -113,6 +115,7 @@ def judge(
     problem: Problem,
     lens: RadialLens,
     covariance: Tensor,
+    grown: Tensor,
     *,
     unknowns: Tensor,
     converged: Tensor,
@@ -125,7 +128,8 @@ def judge(
     Args:
         problem: B items.
         lens: their lenses.
-        covariance: (B, M, M).
+        covariance: (B, 2 + K, 2 + K), if the powers can follow the lens.
+        grown: the same with what the powers leave out.
         unknowns: (B,) parameters asked for.
         converged: (B,) bool.
         held: (B,) bool, items whose centre was found unobservable and kept at its start.
@@ -135,7 +139,10 @@ def judge(
     Returns:
         B members of Status.
     """
-    inlier_share = problem.count / problem.mask.sum((1, 2)).clamp_min(1)
+    inlier_share = torch.minimum(
+        problem.count / problem.mask.sum((1, 2)).clamp_min(1),
+        problem.line_count / problem.mask.any(-1).sum(-1).clamp_min(1),
+    )
     reasons = [
         (Status.TOO_FEW_LINES, too_few(problem.mask, unknowns)),
         (
@@ -143,7 +150,14 @@ def judge(
             outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
         ),
         (Status.TOO_FEW_LINES, too_few(problem.weight > 0, unknowns)),
-        (Status.MISFIT, misfit),
+        (
+            Status.MISFIT,
+            misfit
+            | (
+                (border_sigma(lens, grown) > MISFIT_BORDER_LIMIT * lens.scale)
+                & (border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale)
+            ),
+        ),
         (
             Status.DISTORTION_UNOBSERVABLE,
             ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),

@@ -148,14 +148,21 @@ def with_center_held(known: Uncertainty, covariance: Tensor, center: Tensor) -> 
 
 
 def systematic_covariance(
-    problem: Problem, state: State, free: Tensor, displacements: Tensor
+    problem: Problem,
+    state: State,
+    known: Uncertainty,
+    free: Tensor,
+    prior: Prior | None,
+    displacements: Tensor,
 ) -> Tensor:
     """Covariance of the solution from errors that move many points together.
 
     Args:
         problem: B items.
         state: at the solution.
+        known: `from_residuals`.
         free: (B, M) bool.
+        prior: that the estimate weighed in, and that holds against these errors too.
         displacements: (B, L, P, 2, Q) undistorted px per standard deviation of each of Q
             independent errors.
 
@@ -169,7 +176,10 @@ def systematic_covariance(
     shift = (normal * displacements).sum(-2) / gradient.unsqueeze(-1)
     count = by_theta.shape[-1]
     linear, _, _ = reduce_lines(problem, residual, torch.cat([by_theta, shift], -1), by_line)
-    matrix = masked(linear.normal[:, :count, :count], free)
+    matrix = linear.normal[:, :count, :count]
+    if prior is not None:
+        matrix = matrix + known.rms.square()[:, None, None] * prior.information
+    matrix = masked(matrix, free)
     inverse, failed = _inverse(matrix)
     answer = inverse @ (linear.normal[:, :count, count:] * free[:, :, None])
     answer = torch.where(failed[:, None, None], 0.0, answer)

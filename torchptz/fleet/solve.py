@@ -149,8 +149,6 @@ def _fit(
     fits = {}
     for batch in _batches(items):
         priors = [i.center_covariance for i in batch if i.center_covariance is not None]
-        if options.get("method") == "lanz":  # the paper knows none
-            priors = []
         fit = estimate(
             LinePatterns.stack([item.patterns for item in batch]),
             powers,
