@@ -101,6 +101,7 @@ def accuracy(
     json_path: Path, markdown: Path | None, quick: bool, only: tuple[str, ...], device: str
 ) -> None:
     """Measure how accurate the estimator is, and check what it promises."""
+    _check_device(device)
     started = time.perf_counter()
     asked = [name for name in SECTIONS if not only or name in only]
     report: dict = {
@@ -110,6 +111,10 @@ def accuracy(
         "sections_asked": asked,
     }
     done: list[Section] = []
+    try:
+        _write(report, done, started, json_path, markdown)
+    except OSError as error:  # before hours of figures are lost to it
+        raise click.ClickException(f"cannot write there: {error}") from error
     try:
         for name in asked:
             click.echo(f"{name} ...")
@@ -125,6 +130,14 @@ def accuracy(
     for text in failed:
         click.echo(f"  {text}")
     sys.exit(1 if failed else 0)
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).split("\n")[0]
+        raise click.BadParameter(f"{device!r}: {reason}", param_hint="--device") from error
 
 
 def run_section(name: str, quick: bool, device: str = "cpu") -> Section:

@@ -199,7 +199,11 @@ def _collect_fleet(config: Path, out: Path) -> None:
 @main.command()
 @click.argument("run", type=_OUT)
 @_estimation
-@click.option("--without-offsets", is_flag=True, help="Ignore the points' known offsets.")
+@click.option(
+    "--without-offsets",
+    is_flag=True,
+    help="Ignore the points' known offsets, for comparison; all points are used then.",
+)
 def solve(run: Path, without_offsets: bool, **estimation: object) -> None:
     """Estimate the lenses of all cameras and zooms collected in RUN; write a table for each."""
     from torchptz.fleet.solve import solve

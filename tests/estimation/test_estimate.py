@@ -365,7 +365,35 @@ class TestErrors:
         with pytest.raises(ValueError, match=r"unknown method 'magic'.*ml, lanz"):
             estimate(barrel(), method="magic")
 
-    @pytest.mark.parametrize("powers", [(), (0, 1), (-1, 2), (2, 1), (1, 1), ((1, 2),)])
+    @pytest.mark.parametrize(
+        ("option", "value"),
+        [
+            ("center", torch.zeros(3)),
+            ("center", torch.tensor([float("nan"), 0.0])),
+            ("center_covariance", torch.zeros(2, 2)),
+            ("center_covariance", torch.tensor([[1.0, 5.0], [0.0, 30.0]])),
+            ("center_covariance", torch.eye(3)),
+            ("pixel_aspect", torch.ones(3)),
+            ("pixel_aspect", -1.0),
+        ],
+    )
+    def test_bad_options_are_named(self, option, value):
+        with pytest.raises(ValueError, match=option):
+            estimate(barrel(), **{option: value})
+
+    def test_a_covariance_may_be_symmetric_but_for_rounding(self):
+        covariance = synthetic.double(4.0, 1.0, 1.0 + 1e-14, 9.0).reshape(2, 2)
+        assert estimate(barrel(), center_covariance=covariance).status == [Status.OK]
+
+    def test_gradients_through_the_papers_method_are_refused(self):
+        pattern = barrel()
+        free = replace(pattern, points=pattern.points.clone().requires_grad_())
+        with pytest.raises(ValueError, match="gradients"):
+            estimate(free, method="lanz")
+
+    @pytest.mark.parametrize(
+        "powers", [(), (0, 1), (-1, 2), (2, 1), (1, 1), ((1, 2),), (1, 5000), (1, float("inf"))]
+    )
     def test_bad_powers_are_told(self, powers):
         with pytest.raises(ValueError, match="powers must be"):
             estimate(barrel(), powers=powers)

@@ -48,9 +48,7 @@ def fit_lines(points: Tensor, weight: Tensor) -> Lines:
     return Lines(normal, -(normal * mean).sum(-1))
 
 
-def project_out_lines(
-    columns: Tensor, weight: Tensor, points: Tensor, lines: Lines, gradient: Tensor | None = None
-) -> Tensor:
+def project_out_lines(columns: Tensor, weight: Tensor, points: Tensor, lines: Lines) -> Tensor:
     """The part of per-point columns that refitting the lines cannot take up.
 
     A line has two parameters: its offset moves all residuals alike, its turn moves them in
@@ -61,7 +59,6 @@ def project_out_lines(
         weight: (..., P).
         points: (..., P, 2) px, corrected points.
         lines: their lines.
-        gradient: (..., P) divisor of each residual (`Straightness.gradient`), default 1.
 
     Returns:
         (..., P, M), zero where the weight is.
@@ -69,13 +66,12 @@ def project_out_lines(
     Source: variable projection (Golub and Pereyra) for the lines of paper, section 2.
     """
     root = weight.sqrt().unsqueeze(-1)
-    level = root if gradient is None else root / gradient.unsqueeze(-1)
-    total = (level**2).sum(-2, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    total = (root**2).sum(-2, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
     along = (points * lines.direction.unsqueeze(-2)).sum(-1, keepdim=True)
-    along = along - (level**2 * along).sum(-2, keepdim=True) / total
-    tilt = level * along
+    along = along - (root**2 * along).sum(-2, keepdim=True) / total
+    tilt = root * along
     scaled = columns * root
-    for basis in (level, tilt):  # orthogonal by construction
+    for basis in (root, tilt):  # orthogonal by construction
         squared = (basis**2).sum(-2, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
         scaled = scaled - basis * (basis * scaled).sum(-2, keepdim=True) / squared
     return scaled
