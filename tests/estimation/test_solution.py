@@ -55,3 +55,38 @@ class TestChunks:
         assert parts.status[-1] is Status.CENTER_UNOBSERVABLE
         torch.testing.assert_close(parts.lens.center, whole.lens.center, atol=1e-9, rtol=0)
         torch.testing.assert_close(parts.covariance, whole.covariance, rtol=1e-6, atol=1e-12)
+
+    def test_outliers_are_looked_for_in_parts_too(self, monkeypatch):
+        made = synthetic.pattern_of(synthetic.lens(), points=12)
+        spoilt, wrong = synthetic.with_gross_errors(synthetic.noisy(made, 0.1, draws=5), 0.1)
+        whole = estimate(spoilt)
+        module = importlib.import_module("torchptz.estimation.solution")
+        monkeypatch.setattr(module, "_CHUNK", 2 * spoilt.mask[0].numel())
+        parts = estimate(spoilt)
+        assert torch.equal(parts.inliers, whole.inliers)
+        assert not (parts.inliers & wrong).all(-1).any()
+        torch.testing.assert_close(parts.lens.center, whole.lens.center, atol=1e-9, rtol=0)
+
+
+class TestShortLines:
+    def test_of_fewer_than_three_points_count_for_nothing(self):
+        made = synthetic.noisy(synthetic.pattern_of(synthetic.lens(), points=12), 0.1)
+        mask = made.mask.clone()
+        mask[0, 3, 2:] = False
+        without = made.mask.clone()
+        without[0, 3] = False
+        short, gone = (
+            estimate(LinePatterns(made.points, one, made.image_size)) for one in (mask, without)
+        )
+        assert short.status == gone.status == [Status.OK]
+        torch.testing.assert_close(short.rms_px, gone.rms_px)
+        torch.testing.assert_close(short.lens.center, gone.lens.center, atol=1e-9, rtol=0)
+        assert not short.inliers[0, 3].any()
+
+    def test_two_lines_and_a_point_are_two_lines(self):
+        made = synthetic.noisy(synthetic.pattern_of(synthetic.lens(), points=12), 0.1)
+        mask = torch.zeros_like(made.mask)
+        mask[0, [1, 6]] = True
+        mask[0, 9, 0] = True
+        fit = estimate(LinePatterns(made.points, mask, made.image_size))
+        assert fit.status == [Status.TOO_FEW_LINES]
