@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,14 +17,6 @@ from torchptz.patterns import LinePatterns
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 PLACES = torch.from_numpy(synthetic.grid(synthetic.PAPER_SIZE, 13, 9))[None]
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Import modules as the script does, from its folder."""
-    sys.path.insert(0, str(SCRIPTS))
-    yield importlib.import_module
-    sys.path.remove(str(SCRIPTS))
 
 
 @pytest.fixture

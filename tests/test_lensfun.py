@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,16 +12,7 @@ from torchptz.estimation import Status, estimate
 from torchptz.lens import RadialLens
 
 pytest.importorskip("lensfunpy", reason="the Lensfun database comes with lensfunpy")
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 FEW = 23  # lenses
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Import modules as the benchmark does, from its folder."""
-    sys.path.insert(0, str(SCRIPTS))
-    yield importlib.import_module
-    sys.path.remove(str(SCRIPTS))
 
 
 @pytest.fixture(scope="module")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -14,16 +11,7 @@ from tests import synthetic
 from torchptz.estimation import estimate
 
 pytest.importorskip("lensfunpy", reason="half of the lenses are of the Lensfun database")
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 SIGMA = 0.1
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Import modules as the benchmark does, from its folder."""
-    sys.path.insert(0, str(SCRIPTS))
-    yield importlib.import_module
-    sys.path.remove(str(SCRIPTS))
 
 
 @pytest.fixture(scope="module")

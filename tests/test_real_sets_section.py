@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,17 +13,8 @@ from scipy.optimize import minimize
 
 from tests import synthetic
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 LENS = synthetic.lens((0.02, 0.08, 0.0), powers=(1, 2, 3))
 TRUTH = synthetic.truth_of(LENS)
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Import modules as the script does, from its folder."""
-    sys.path.insert(0, str(SCRIPTS))
-    yield importlib.import_module
-    sys.path.remove(str(SCRIPTS))
 
 
 @pytest.fixture(scope="module")
