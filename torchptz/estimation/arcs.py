@@ -5,13 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchptz.estimation.problem import Problem
+from torchptz.estimation.problem import FEWEST_POINTS, Problem
 
 NORMAL_MEDIAN = 0.6745  # of |x| for a unit normal x
 # Of the half width: lenses follow the model no better, so that less says nothing of a point.
 FINEST = 1e-4
 
-_FEWEST_POINTS = 3
 _CANDIDATES = 60  # parabolas tried per line
 _ARC_CUT, _ARC_DEGREE, _ARC_ROUNDS = 4.0, 4, 4
 
@@ -55,7 +54,7 @@ def on_arcs(problem: Problem) -> Tensor:
     points = _shifted_points(problem)
     along, height, distance = _best_arc(problem, points, used, count)
     # A line of very few points may fit its arc by chance: the others say what is noise.
-    told = count > _FEWEST_POINTS
+    told = count > FEWEST_POINTS
     finest = FINEST * problem.scale[:, None]
     half = _half(count).unsqueeze(-1)
     sigma = distance.sort(-1).values.gather(-1, half).squeeze(-1) / NORMAL_MEDIAN

@@ -14,7 +14,7 @@ from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 
 _MOST_FACTORS = 8
-_FEWEST_POINTS = 3  # of a line
+FEWEST_POINTS = 3  # of a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class Problem(Batched):
         """The same problem with the points (B, L, P) bool only, weights renewed to mean 1."""
         weight = torch.where(inliers, self.weight, 0.0)
         # Fewer points are straight whatever the lens, and cost degrees of freedom.
-        enough = (weight > 0).sum(-1, keepdim=True) >= _FEWEST_POINTS
+        enough = (weight > 0).sum(-1, keepdim=True) >= FEWEST_POINTS
         weight = torch.where(enough, weight, 0.0)
         count = (weight > 0).sum((1, 2), keepdim=True)
         total = weight.sum((1, 2), keepdim=True)

@@ -17,7 +17,7 @@ from torchptz.estimation.arcs import (
     on_arcs,
 )
 from torchptz.estimation.maximum_likelihood import start_from_loop
-from torchptz.estimation.problem import Problem
+from torchptz.estimation.problem import FEWEST_POINTS, Problem
 from torchptz.estimation.refinement import refine
 from torchptz.estimation.residuals import State, straightness
 
@@ -37,7 +37,6 @@ _REWEIGHTINGS, _WEIGHTED_STEPS = 12, 2
 _BIWEIGHT = 4.685  # Tukey's, 95 % efficient
 _ROUNDS = 6
 _MOST_INLIERS = 0.7  # a fit that gives up more of the points than this leaves is not believed
-_FEWEST_POINTS = 3
 _TELLING_POINTS, _TELLING_LINES = 5, 6  # fewer say nothing of how lines differ
 _EXCESS = 3.0  # standard deviations
 _RIDDEN = 5.0
@@ -240,7 +239,7 @@ def _within(problem: Problem, state: State, inliers: Tensor) -> Tensor:
     scale = _line_sigma(whitened, inliers, sigma)
     near = used & (whitened.abs() <= CUT * scale.unsqueeze(-1))
     bad = bad_lines(near, whitened, scale)
-    few = near.sum(-1) < ((used.sum(-1) + 1) // 2).clamp_min(_FEWEST_POINTS)
+    few = near.sum(-1) < ((used.sum(-1) + 1) // 2).clamp_min(FEWEST_POINTS)
     return near & ~(bad | few).unsqueeze(-1)
 
 

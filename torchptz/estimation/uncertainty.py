@@ -22,9 +22,8 @@ class Uncertainty(Batched):
     """Noise and covariances of B estimates."""
 
     rms: Tensor  # (B,) px, per degree of freedom; NaN where there are none
-    inflation: (
-        Tensor  # (B,) of the variance, since points of a line err together; 1 for white noise
-    )
+    # (B,) of the variance, since points of a line err together; 1 for white noise
+    inflation: Tensor
     covariance: Tensor  # (B, M, M), of what the lines say alone; inf on the diagonal: nothing
     linear: Linearised
 
