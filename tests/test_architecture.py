@@ -11,11 +11,24 @@ import torchptz
 
 ROOT = Path(torchptz.__file__).parent
 CORE = (
-    *("batch", "displacement", "estimation", "files", "geometry", "lens", "patterns", "radial"),
-    *("rectangle", "rectification", "zoom_table", "zoom_table_file"),
+    *("batch", "calibration", "displacement", "estimation", "files", "geometry", "intrinsics"),
+    *(
+        "lens",
+        "observations",
+        "patterns",
+        "radial",
+        "rectangle",
+        "rectification",
+        "zoom_interpolation",
+        "zoom_knot",
+    ),
+    *("zoom_table", "zoom_table_file"),
 )
 EDGE = ("cameras", "cli", "export", "fleet", "report", "scanning", "simulation")
-PUBLIC = ("LinePatterns", "RadialLens", "Status", "ZoomTable", "estimate", "rectify")
+PUBLIC = (
+    *("Calibration", "CalibratedLens", "LinePatterns", "Observations", "Priors", "RadialLens"),
+    *("Status", "ZoomTable", "calibrate", "estimate", "rectify"),
+)
 
 
 def sources(part: str) -> list[Path]:

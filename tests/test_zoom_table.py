@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchptz.intrinsics import CalibratedLens
 from torchptz.lens import RadialLens
 from torchptz.zoom_table import Knot, ZoomTable
 
@@ -20,6 +21,9 @@ NOMINAL = [1.0, 2.1, 8.1]
 UNITS = [0.0, 3000.0, 9000.0]
 CENTERS = [[310.0, 250.0], [320.0, 245.0], [322.0, 240.0]]
 COEFFICIENTS = [[-0.1, 0.02], [-0.04, 0.01], [0.0, 0.002]]
+FOCAL = [500.0, 990.0, 4010.0]
+POINTS = [[318.0, 241.0], [319.0, 240.0], [321.5, 238.0]]
+INTRINSICS = ("focal_length", "principal_point", "covariance")
 
 
 class Status(Enum):
@@ -51,6 +55,33 @@ def full_table(**options):
         principal_point_covariance=[[1.0, 0.1], [0.1, 2.0]],
         **options,
     )
+
+
+def some_covariance(seed=0, count=3):
+    """(count, 7, 7), correlated."""
+    sigmas = np.array([0.5, 0.3, 2e-3, 1e-3, 3.0, 0.7, 0.4])
+    mixed = np.random.default_rng(seed).normal(size=(count, 7, 7)) * sigmas[:, None]
+    return torch.from_numpy(mixed @ mixed.transpose(0, 2, 1))
+
+
+def calibrated_table(**options):
+    known = {
+        "focal_length_px": FOCAL,
+        "principal_point": POINTS,
+        "intrinsics_covariance": some_covariance(),
+        "pupil_m": [0.03, 0.02, math.nan],
+        "pupil_sigma_m": [0.001, 0.002, math.nan],
+    }
+    return ZoomTable.from_lens(lenses(), ZOOMS, camera="north", **(known | options))
+
+
+def with_unknown(covariance, *unknowns):
+    """Inf on the diagonal of some unknowns, correlated with nothing."""
+    covariance = covariance.clone()
+    for unknown in unknowns:
+        covariance[..., unknown, :] = covariance[..., unknown] = 0
+        covariance[..., unknown, unknown] = math.inf
+    return covariance
 
 
 def assert_same_lens(one, other, **tolerance):
@@ -143,6 +174,171 @@ class TestRange:
     def test_no_magnification(self, zoom):
         with pytest.raises(ValueError, match="north: zoom must be one positive magnification"):
             full_table().at(zoom, extrapolate=True)
+
+
+class TestIntrinsics:
+    def test_a_knot_is_its_own(self):
+        table = calibrated_table()
+        for found in (table.at(ZOOMS), table.lens):
+            assert isinstance(found, CalibratedLens)
+            torch.testing.assert_close(found.focal_length, torch.tensor(FOCAL).double())
+            torch.testing.assert_close(found.principal_point, torch.tensor(POINTS).double())
+            torch.testing.assert_close(found.covariance, some_covariance(), rtol=1e-12, atol=1e-18)
+
+    def test_between_two_knots_by_hand(self):
+        """Half way from 2x to 8x in the logarithm is 4x."""
+        found = calibrated_table().at(4.0)
+        focal_length = math.sqrt(FOCAL[1] * FOCAL[2])
+        assert found.focal_length.tolist() == pytest.approx([focal_length], rel=1e-14)
+        assert found.principal_point[0].tolist() == pytest.approx([320.25, 239.0], rel=1e-14)
+        expected = np.zeros((7, 7))
+        for knot in (1, 2):
+            to_here = np.diag([1, 1, 1, 1, focal_length / FOCAL[knot], 1, 1])
+            expected += to_here @ some_covariance()[knot].numpy() @ to_here / 2
+        np.testing.assert_allclose(found.covariance[0], expected, rtol=1e-12, atol=1e-18)
+
+    @given(seed=st.integers(0, 2**32 - 1), zoom=st.floats(2, 8))
+    @settings(max_examples=50, deadline=None)
+    def test_the_covariance_bounds_that_of_the_mean_of_both_knots(self, seed, zoom):
+        """Whatever the correlation of the knots' errors, which the table does not know."""
+        generator = np.random.default_rng(seed)
+        scale = np.array([0.5, 0.3, 2e-3, 1e-3, 3.0, 0.7, 0.4] * 2)
+        mixed = generator.normal(size=(14, generator.integers(1, 20))) * scale[:, None]
+        joint = mixed @ mixed.T  # of the errors at 2x and those at 8x
+        blocks = torch.from_numpy(np.stack([np.eye(7), joint[:7, :7], joint[7:, 7:]]))
+        found = calibrated_table(intrinsics_covariance=blocks).at(zoom)
+
+        weight = math.log(zoom / 2) / math.log(4)
+        focal_length = FOCAL[1] ** (1 - weight) * FOCAL[2] ** weight
+        parts = []
+        for knot, share in ((1, 1 - weight), (2, weight)):
+            parts.append(share * np.diag([1, 1, 1, 1, focal_length / FOCAL[knot], 1, 1]))
+        true = np.hstack(parts) @ joint @ np.hstack(parts).T
+        excess = (found.covariance[0].numpy() - true) / np.outer(scale[:7], scale[:7])
+        assert np.linalg.eigvalsh(excess).min() >= -1e-9 * np.abs(excess).max() - 1e-9
+
+    def test_and_is_that_where_both_err_alike(self):
+        alike = some_covariance(count=1).repeat(3, 1, 1)
+        alike = with_unknown(alike, 4)  # the only one whose units change with the zoom
+        found = calibrated_table(intrinsics_covariance=alike).at([1.3, 3.0, 7.0])
+        torch.testing.assert_close(found.covariance, alike, rtol=1e-12, atol=1e-18)
+
+    def test_gradient_in_zoom(self):
+        zoom = torch.tensor([1.3, 5.0], dtype=torch.float64, requires_grad=True)
+        for name in INTRINSICS:
+            assert torch.autograd.gradcheck(
+                lambda z, name=name: getattr(calibrated_table().at(z), name), zoom
+            )
+
+    @pytest.mark.parametrize(
+        ("lengths", "unknown"),
+        [([*FOCAL[:2], math.nan], [False, True]), ([FOCAL[0], math.nan, math.nan], [True, True])],
+    )
+    def test_the_gradient_survives_what_is_not_known(self, lengths, unknown):
+        zoom = torch.tensor([1.3, 5.0], dtype=torch.float64, requires_grad=True)
+        found = calibrated_table(focal_length_px=lengths).at(zoom)
+        assert found.focal_length.isnan().tolist() == unknown
+        infinite = found.covariance.diagonal(dim1=1, dim2=2).isinf()
+        assert infinite[:, 4].tolist() == unknown
+        assert int(infinite.sum()) == sum(unknown)
+        known = torch.where(found.covariance.isinf(), 0.0, found.covariance).sum()
+        length = torch.where(found.focal_length.isnan(), 0.0, found.focal_length).sum()
+        (slope,) = torch.autograd.grad(known + found.principal_point.sum() + length, zoom)
+        assert bool((slope.isfinite() & (slope != 0)).all())
+
+    @given(zooms=st.lists(st.floats(1, 8), min_size=1, max_size=5))
+    @settings(max_examples=30, deadline=None)
+    def test_items_do_not_know_of_each_other(self, zooms):
+        table = calibrated_table(focal_length_px=[math.nan, *FOCAL[1:]])
+        together = table.at(zooms)
+        for i, zoom in enumerate(zooms):
+            for name in INTRINSICS:
+                torch.testing.assert_close(
+                    getattr(together[i], name), getattr(table.at(zoom), name),
+                    rtol=1e-14, atol=0, equal_nan=True,
+                )  # fmt: skip
+
+    def test_a_table_of_lines_says_what_it_knows(self):
+        """The principal point and its covariance are the table's, the focal lengths' are apart."""
+        found = full_table().at([1.0, 4.0])
+        torch.testing.assert_close(
+            found.focal_length, torch.tensor([500.0, 2000.0], dtype=torch.float64)
+        )
+        assert found.principal_point.tolist() == [[321.0, 239.0]] * 2
+        expected = torch.zeros(2, 7, 7, dtype=torch.float64)
+        expected[:, :4, :4] = torch.eye(4) * 0.25 + 0.5  # with the systematic one
+        expected[:, 4, 4] = torch.tensor([1.0, 16.0])
+        expected[:, 5:, 5:] = torch.tensor([[1.0, 0.1], [0.1, 2.0]], dtype=torch.float64)
+        torch.testing.assert_close(found.covariance, expected)
+
+    def test_a_table_that_knows_nothing_says_none(self):
+        found = ZoomTable.from_lens(lenses(), ZOOMS).at([1.0, 4.0])
+        assert [getattr(found, name) for name in INTRINSICS] == [None] * 3
+        with pytest.raises(ValueError, match="focal length of this lens is not known"):
+            found.rays(torch.zeros(1, 1, 2))
+
+    def test_a_knot_that_does_not_know_leaves_a_gap(self):
+        points = [POINTS[0], [math.nan] * 2, POINTS[2]]
+        lengths = [FOCAL[0], math.nan, FOCAL[2]]
+        covariance = some_covariance()
+        covariance[2] = math.nan
+        table = calibrated_table(
+            focal_length_px=lengths, principal_point=points, intrinsics_covariance=covariance
+        )
+        assert table.knots[1].principal_point is None
+        assert table.knots[2].intrinsics_covariance is None
+        found = table.at([1.0, 1.5, 2.0, 4.0, 8.0])
+        assert found.focal_length.isnan().tolist() == [False, True, True, True, False]
+        assert found.principal_point.isnan().any(1).tolist() == [False, True, True, True, False]
+        unknown = found.covariance.diagonal(dim1=1, dim2=2).isinf().double()
+        assert unknown[0].tolist() == [0] * 7
+        assert unknown[1].tolist() == unknown[2].tolist() == [0] * 4 + [1] * 3
+        assert unknown[3].tolist() == unknown[4].tolist() == [1] * 7
+        block = found.covariance[2, :4, :4]
+        torch.testing.assert_close(block, some_covariance()[1, :4, :4], rtol=1e-12, atol=1e-18)
+
+    def test_a_knot_without_a_principal_point_has_the_table_s(self):
+        knots = [
+            Knot(1.0, lenses()[0], principal_point=[1.0, 2.0]),
+            Knot(2.0, lenses()[1], intrinsics_covariance=some_covariance()[1]),
+        ]
+        table = ZoomTable("cam", knots, [3.0, 4.0], [[9.0, 1.0], [1.0, 4.0]])
+        assert table.lens.principal_point.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+        own, fallen_back = table.lens.covariance
+        assert own.diagonal().tolist() == [math.inf] * 7
+        assert fallen_back[5:, 5:].tolist() == [[9.0, 1.0], [1.0, 4.0]]
+        assert not bool(fallen_back[5:, :5].any())
+
+    def test_only_usable_knots_count(self):
+        table = calibrated_table(status=["OK", "X", "OK"])
+        assert table.at(4.0).focal_length[0] == pytest.approx(
+            FOCAL[0] ** (1 / 3) * FOCAL[2] ** (2 / 3)
+        )
+
+    def test_beyond_the_knots(self):
+        """Held next to them, for nominal zooms; farther out it follows the magnification."""
+        table = calibrated_table()
+        held = table.at([1 / 1.015, 8 * 1.015])
+        torch.testing.assert_close(held.focal_length, table.lens.focal_length[[0, 2]])
+        far = table.at([0.5, 20.0], extrapolate=True)
+        expected = [FOCAL[0] / 2, FOCAL[2] * 2.5]
+        torch.testing.assert_close(far.focal_length, torch.tensor(expected, dtype=torch.float64))
+        assert far.principal_point.tolist() == [POINTS[0], POINTS[2]]
+        before = table.lens.covariance[[0, 2]]
+        torch.testing.assert_close(far.lens_covariance, before[:, :4, :4])
+        relative = far.covariance[:, 4, 4] / far.focal_length**2
+        torch.testing.assert_close(relative, before[:, 4, 4] / table.lens.focal_length[[0, 2]] ** 2)
+
+    def test_by_the_device_s_units(self):
+        table = calibrated_table(zoom_units=UNITS)
+        torch.testing.assert_close(
+            table.at_units(UNITS).focal_length, torch.tensor(FOCAL, dtype=torch.float64)
+        )
+
+    def test_a_point_is_seen_along_its_ray(self):
+        table, point = calibrated_table(), torch.tensor([[[37.0, 411.0]]], dtype=torch.float64)
+        found = table.at([1.0, 3.0, 8.0])
+        torch.testing.assert_close(found.project(found.rays(point)), point.expand(3, 1, 2))
 
 
 class TestUnits:
@@ -264,6 +460,39 @@ class TestFile:
             assert old.systematic_covariance is None
             torch.testing.assert_close(old.covariance, knot.covariance, rtol=0, atol=0)
 
+    def test_round_trip_of_intrinsics(self, tmp_path):
+        covariance = with_unknown(some_covariance(), 5, 6)
+        path, table = tmp_path / "table.json", calibrated_table(intrinsics_covariance=covariance)
+        table.save(path)
+        stored = json.loads(path.read_text(), parse_constant=pytest.fail)
+        assert stored["knots"][0]["intrinsics_covariance"][6] == [0, 0, 0, 0, 0, 0, None]
+        assert stored["knots"][2]["pupil_m"] is None
+        loaded = ZoomTable.load(path)
+        for one, other in zip(loaded.knots, table.knots, strict=True):
+            assert torch.equal(one.principal_point, other.principal_point)
+            assert torch.equal(one.intrinsics_covariance, other.intrinsics_covariance)
+            assert torch.equal(one.covariance, other.intrinsics_covariance[:4, :4])
+            assert (one.pupil_m, one.pupil_sigma_m) == (other.pupil_m, other.pupil_sigma_m)
+        assert (loaded.knots[1].pupil_m, loaded.knots[1].pupil_sigma_m) == (0.02, 0.002)
+        for name in INTRINSICS:
+            assert torch.equal(getattr(loaded.at([1, 3]), name), getattr(table.at([1, 3]), name))
+        loaded.save(tmp_path / "again.json")
+        assert (tmp_path / "again.json").read_bytes() == path.read_bytes()
+
+    def test_a_table_from_before_intrinsics_is_read(self, tmp_path):
+        path = tmp_path / "table.json"
+        full_table().save(path)
+        stored = json.loads(path.read_text())
+        assert stored["version"] == 1
+        for knot in stored["knots"]:
+            for name in ("principal_point", "intrinsics_covariance", "pupil_m", "pupil_sigma_m"):
+                assert knot.pop(name) is None
+        path.write_text(json.dumps(stored))
+        old, new = ZoomTable.load(path).at([1, 3]), full_table().at([1, 3])
+        assert_same_lens(old, new, rtol=0, atol=0)
+        for name in INTRINSICS:
+            assert torch.equal(getattr(old, name), getattr(new, name))
+
     def test_an_interrupted_write_leaves_the_old_table(self, tmp_path, monkeypatch):
         path = tmp_path / "table.json"
         full_table().save(path)
@@ -292,6 +521,20 @@ class TestFile:
 
         expected = full_table().at(2.0).undistort(torch.from_numpy(point)[None, None])
         np.testing.assert_allclose(undistorted, expected[0, 0], rtol=1e-14)
+
+    def test_a_few_lines_more_find_its_ray(self, tmp_path):
+        calibrated_table().save(tmp_path / "table.json")
+        undistorted = np.array([37.0, 411.0])
+
+        table = json.loads((tmp_path / "table.json").read_text())
+        knot = next(knot for knot in table["knots"] if knot["zoom"] == 2 and knot["usable"])
+        f, (x, y) = knot["focal_length_px"], knot["principal_point"] or table["principal_point"]
+        matrix = [[f, 0, x], [0, f * table["pixel_aspect"], y], [0, 0, 1]]
+        ray = np.linalg.solve(matrix, [*undistorted, 1])
+
+        lens = calibrated_table().at(2.0)
+        expected = lens.rays(lens.distort(torch.from_numpy(undistorted)[None, None]))[0, 0]
+        np.testing.assert_allclose(ray / np.linalg.norm(ray), expected, rtol=0, atol=1e-12)
 
     def test_it_is_strict_json_with_a_schema(self, tmp_path):
         full_table(status=["OK", "X", "Y"]).save(tmp_path / "table.json")
@@ -352,6 +595,19 @@ class TestRefusedFiles:
             ("covariance", [None] * 4, "knots[1].covariance must be a list of 4x4 finite"),
             ("covariance", [[math.nan] * 4] * 4, "knots[1].covariance must be a list of 4x4"),
             ("systematic_covariance", [[1]], "knots[1].systematic_covariance must be a list of"),
+            (
+                "intrinsics_covariance",
+                [[1]],
+                "knots[1].intrinsics_covariance must be a list of 7x7",
+            ),
+            (
+                "intrinsics_covariance",
+                torch.eye(7).tolist(),
+                "knots[1]: zoom 2: covariance is not the block of centre and coefficients",
+            ),
+            ("principal_point", [1], "knots[1].principal_point must be a list of 2 finite numbers"),
+            ("pupil_m", "far", "knots[1].pupil_m must be a finite number, not 'far'"),
+            ("focal_length_px", -7, "knots[1]: zoom 2: focal_length_px must be positive, not -7"),
             ("nominal_zoom", -1, "knots[1]: zoom 2: nominal_zoom must be a positive magnif"),
             ("rms_px", "small", "knots[1].rms_px must be a finite number, not 'small'"),
             ("usable", "yes", "knots[1].usable must be true or false, not 'yes'"),
@@ -428,3 +684,33 @@ class TestMaking:
     def test_principal_point(self):
         with pytest.raises(ValueError, match="cam: principal_point must be finite"):
             ZoomTable.from_lens(lenses(), ZOOMS, camera="cam", principal_point=[1.0, math.nan])
+
+    @pytest.mark.parametrize(
+        ("name", "values", "words"),
+        [
+            (
+                "intrinsics_covariance",
+                torch.ones(3, 6, 6),
+                r"must have shape \(7, 7\), not \(6, 6\)",
+            ),
+            ("principal_point", torch.ones(3, 3), r"must have shape \(2,\), not \(3,\)"),
+            ("focal_length_px", [0.0, 1.0, 2.0], "must be positive, not 0"),
+        ],
+    )
+    def test_refusals_name_camera_and_zoom(self, name, values, words):
+        with pytest.raises(ValueError, match=f"north: zoom 1: {name} {words}"):
+            calibrated_table(**{name: values})
+
+    def test_covariances_that_contradict_each_other(self):
+        with pytest.raises(ValueError, match="north: zoom 1: covariance is not the block"):
+            calibrated_table(covariance=torch.eye(4).repeat(3, 1, 1))
+        table = calibrated_table(covariance=some_covariance()[:, :4, :4])
+        assert torch.equal(table.knots[0].covariance, some_covariance()[0, :4, :4])
+
+    def test_the_covariance_of_all_tells_that_of_its_parts(self):
+        knot = calibrated_table().knots[1]
+        assert torch.equal(knot.covariance, some_covariance()[1, :4, :4])
+        assert knot.focal_length_sigma_px == pytest.approx(some_covariance()[1, 4, 4] ** 0.5)
+        assert calibrated_table(focal_length_sigma_px=[1, 2, 3]).knots[1].focal_length_sigma_px == 2
+        without = calibrated_table(intrinsics_covariance=with_unknown(some_covariance(), 4))
+        assert without.knots[1].focal_length_sigma_px is None

@@ -13,15 +13,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchptz.intrinsics import CalibratedLens
 from torchptz.lens import RadialLens
-from torchptz.zoom_table_file import COVARIANCES, read_table, write_table
+from torchptz.zoom_interpolation import between, interpolated
+from torchptz.zoom_knot import Knot, is_finite
+from torchptz.zoom_table_file import read_table, write_table
+
+__all__ = ["Knot", "ZoomTable"]
 
 # Magnifications that differ by less than this part are the same one.
 _SAME_ZOOM = 1e-6
 # Knots lie at measured magnifications, a little off the nominal ones that people ask for. So little
 # beyond the outermost knot, its lens still holds.
 _BEYOND = 0.02
-_ESTIMATED = ("rms_px", "gain", "gain_sigma", "focal_length_px", "focal_length_sigma_px")
 
 
 def _created_by() -> str:
@@ -29,67 +33,6 @@ def _created_by() -> str:
         return f"torchptz {version('torchptz')}"
     except PackageNotFoundError:  # used from a folder, without having been installed
         return "torchptz"
-
-
-@dataclass(frozen=True, eq=False)
-class Knot:
-    """What is known about the lens at one zoom; None where something is not known."""
-
-    zoom: float  # magnification as measured, 1 = widest
-    lens: RadialLens | None  # batch of one
-    status: str = "OK"  # name of the fit's status
-    usable: bool | None = None  # whether `ZoomTable.at` may use it; default: status is OK
-    nominal_zoom: float | None = None  # magnification that was asked for
-    zoom_units: float | None = None  # the device's own
-    rms_px: float | None = None  # px, distance of the points from their lines
-    gain: float | None = None  # of the offsets
-    gain_sigma: float | None = None
-    # (2+K, 2+K), order (cx px, cy px, coefficients); inf on the diagonal of what is not known
-    covariance: Tensor | None = None
-    # the same, of errors of the head's geometry, which no residual shows
-    systematic_covariance: Tensor | None = None
-    focal_length_px: float | None = None  # px
-    focal_length_sigma_px: float | None = None  # px
-    points: int | None = None  # how many the fit saw
-    lines: int | None = None
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.zoom) and self.zoom > 0):
-            raise ValueError(f"zoom must be a positive magnification, not {self.zoom}")
-        where = f"zoom {self.zoom:g}"
-        if self.lens is not None and len(self.lens) != 1:
-            raise ValueError(f"{where}: a knot has one lens, not {len(self.lens)}")
-        usable = self.status == "OK" if self.usable is None else bool(self.usable)
-        object.__setattr__(self, "usable", usable)
-        # Not finite is an estimate's way to say "not known".
-        for name in ("nominal_zoom", "zoom_units", *_ESTIMATED):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                object.__setattr__(self, name, None)
-        if self.nominal_zoom is not None and not self.nominal_zoom > 0:
-            raise ValueError(
-                f"{where}: nominal_zoom must be a positive magnification, not {self.nominal_zoom}"
-            )
-        if self.lens is not None and not _is_finite(self.lens.center, self.lens.coefficients):
-            object.__setattr__(self, "lens", None)
-        if usable and self.lens is None:
-            raise ValueError(
-                f"{where}: status {self.status}, but its lens is missing or not finite"
-            )
-        for name in COVARIANCES:
-            object.__setattr__(self, name, self._checked_covariance(name, where))
-
-    def _checked_covariance(self, name: str, where: str) -> Tensor | None:
-        if self.lens is None or getattr(self, name) is None:
-            return None
-        covariance = torch.as_tensor(getattr(self, name), dtype=torch.float64)
-        size = 2 + len(self.lens.powers)
-        if covariance.shape != (size, size):
-            raise ValueError(
-                f"{where}: {name} must have shape {(size, size)}, not {tuple(covariance.shape)}"
-            )
-        known = not bool((covariance.isnan() | covariance.isneginf()).any())
-        return covariance if known else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +46,7 @@ class ZoomTable:
     Args:
         camera: its name.
         knots: by ascending measured magnification.
-        principal_point: (2,) px, or None.
+        principal_point: (2,) px, of all knots that do not know their own, or None.
         principal_point_covariance: (2, 2) px^2, or None.
         created_by: program and version that made the table.
 
@@ -126,7 +69,7 @@ class ZoomTable:
             if value is None:
                 continue
             value = torch.as_tensor(value, dtype=torch.float64)
-            if value.shape != shape or not _is_finite(value):
+            if value.shape != shape or not is_finite(value):
                 raise ValueError(
                     f"{self.camera}: {name} must be finite, of shape {shape}, not {value.tolist()}"
                 )
@@ -159,14 +102,18 @@ class ZoomTable:
             zooms: (B,) measured magnifications, in any order.
             camera: its name.
             status: (B,) `Status` or text; default all OK.
-            principal_point, principal_point_covariance: of the whole table.
-            per_knot: any other field of `Knot`, (B,) or (B, 2+K, 2+K); NaN is "not known".
+            principal_point: (2,) px of the whole table, or (B, 2) px of each knot.
+            principal_point_covariance: (2, 2) px^2, of the whole table.
+            per_knot: any other field of `Knot`, with the batch ahead of its shape: (B,),
+                (B, 2+K, 2+K), (B, 5+K, 5+K); NaN is "not known".
 
         Raises:
             ValueError: lengths that differ, and all that `ZoomTable` and `Knot` refuse.
         """
         zooms = torch.as_tensor(zooms, dtype=torch.float64).tolist()
         columns = {name: values for name, values in per_knot.items() if values is not None}
+        if principal_point is not None and torch.as_tensor(principal_point).ndim == 2:
+            columns["principal_point"], principal_point = principal_point, None
         columns["status"] = ["OK"] * len(lens) if status is None else [*map(_status_name, status)]
         unknown = set(columns) - {f.name for f in fields(Knot)}
         if unknown:
@@ -174,10 +121,15 @@ class ZoomTable:
         for name, values in {"zooms": zooms, **columns}.items():
             if len(values) != len(lens):
                 raise ValueError(f"{camera}: {len(values)} {name} for {len(lens)} lenses")
-        knots = [
-            Knot(zoom, lens[i], **{name: _number(values[i]) for name, values in columns.items()})
-            for i, zoom in enumerate(zooms)
-        ]
+        try:
+            knots = [
+                Knot(
+                    zoom, lens[i], **{name: _number(column[i]) for name, column in columns.items()}
+                )
+                for i, zoom in enumerate(zooms)
+            ]
+        except ValueError as error:
+            raise ValueError(f"{camera}: {error}") from error
         return cls(
             camera,
             tuple(sorted(knots, key=lambda knot: knot.zoom)),
@@ -196,42 +148,67 @@ class ZoomTable:
         return [knot.zoom for knot in self.usable]
 
     @property
-    def lens(self) -> RadialLens:
+    def lens(self) -> CalibratedLens:
         """Lenses of the usable knots, a batch over `zooms`.
 
         Raises:
             ValueError: no knot is usable.
         """
-        lenses = [knot.lens for knot in self.usable]
-        if not lenses:
+        knots = self.usable
+        if not knots:
             statuses = ", ".join(f"{knot.zoom:g}: {knot.status}" for knot in self.knots) or "none"
             raise ValueError(
                 f"{self.camera}: no zoom of the table has a usable lens ({statuses}); "
                 "calibrate the camera again"
             )
-        return RadialLens(
-            torch.cat([lens.center for lens in lenses]),
-            torch.cat([lens.coefficients for lens in lenses]),
-            lenses[0].powers,
-            lenses[0].scale,
-            lenses[0].image_size,
-            lenses[0].pixel_aspect,
+        center = torch.cat([knot.lens.center for knot in knots])
+        lengths = [knot.focal_length_px for knot in knots]
+        focal_length = center.new_tensor([math.nan if f is None else f for f in lengths])
+        point = center.new_full((2,), math.nan)
+        if self.principal_point is not None:
+            point = self.principal_point
+        points = [point if k.principal_point is None else k.principal_point for k in knots]
+        principal_point = torch.stack([one.to(center) for one in points])
+        covariance = torch.stack(
+            [knot.full_covariance(self.principal_point_covariance) for knot in knots]
+        )
+        nothing = covariance.diagonal(dim1=1, dim2=2).isinf().all()
+        return CalibratedLens(
+            center,
+            torch.cat([knot.lens.coefficients for knot in knots]),
+            knots[0].lens.powers,
+            knots[0].lens.scale,
+            knots[0].lens.image_size,
+            knots[0].lens.pixel_aspect,
+            focal_length=None if bool(focal_length.isnan().all()) else focal_length,
+            principal_point=None if bool(principal_point.isnan().all()) else principal_point,
+            covariance=None if bool(nothing) else covariance,
         )
 
-    def at(self, zoom: float | Sequence[float] | Tensor, extrapolate: bool = False) -> RadialLens:
-        """The lens at a measured magnification.
+    def at(
+        self, zoom: float | Sequence[float] | Tensor, extrapolate: bool = False
+    ) -> CalibratedLens:
+        """The lens at a measured magnification, with what is known of its camera matrix.
 
         Coefficients and centre run linearly with the logarithm of the magnification, so that
         ``r L(r)`` is monotonic between two knots wherever it is at both. Up to 2 % beyond the knots
         the lens of the outermost one is held: a camera asked for 12x may have been measured at
         11.97x, and a table must answer for its own ends.
 
+        So do the principal point and the logarithm of the focal length; ``covariance`` is the same
+        mean of the knots' covariances (with their systematic ones, and of the logarithm of the
+        focal length), which bounds that of the lens whatever the correlation of the errors at both
+        knots. How far the true lens is from the straight line between two knots is not in it.
+        Where one of the two knots does not know a number, the lens does not.
+
         Args:
             zoom: a number for a batch of one, or (B,); 1 = widest. Differentiable. Who knows
                 only the nominal magnification finds the measured one in ``knots``, or asks by
                 the device's units.
             extrapolate: farther beyond the knots, hold the lens of the outermost knot. Holding
-                cannot make up a distortion that nobody has measured, continuing a line can.
+                cannot make up a distortion that nobody has measured, continuing a line can. Only
+                the focal length goes on in proportion to the magnification, as that is what
+                magnification means.
 
         Returns:
             A batch of one or B lenses, on the device of ``zoom``.
@@ -258,19 +235,13 @@ class ZoomTable:
                 f"{self.zooms[0]:g} to {self.zooms[-1]:g}{self._if_nominal(asked)}; calibrate "
                 "there too, or ask with extrapolate=True for the lens of the nearest knot"
             )
-        below, above, weight = _between(knots, where)
-        return RadialLens(
-            torch.lerp(lens.center[below], lens.center[above], weight.unsqueeze(-1)),
-            torch.lerp(lens.coefficients[below], lens.coefficients[above], weight.unsqueeze(-1)),
-            lens.powers,
-            lens.scale[:1],
-            lens.image_size[:1],
-            lens.pixel_aspect[:1],
-        )
+        below, above, weight = between(knots, where)
+        excess = torch.where(beyond, where - where.clamp(knots[0], knots[-1]), 0.0)
+        return interpolated(lens[below], lens[above], weight, excess.exp())
 
     def at_units(
         self, zoom_units: float | Sequence[float] | Tensor, extrapolate: bool = False
-    ) -> RadialLens:
+    ) -> CalibratedLens:
         """The lens at a zoom in the device's own units; else as `at`.
 
         The logarithm of the magnification runs linearly with the units between two knots.
@@ -303,7 +274,7 @@ class ZoomTable:
                 f"calibrated range {units[0].item():g} to {units[-1].item():g}; calibrate there "
                 "too, or ask with extrapolate=True for the lens of the nearest knot"
             )
-        below, above, weight = _between(units, asked)
+        below, above, weight = between(units, asked)
         return torch.lerp(zooms.log()[below], zooms.log()[above], weight).exp()
 
     def save(self, path: str | Path) -> None:
@@ -318,7 +289,7 @@ class ZoomTable:
             ValueError: not such a file, one of a later version, a field that is missing or does
                 not hold finite numbers; names the file and the field.
         """
-        return read_table(path, cls, Knot)
+        return read_table(path, cls)
 
     def _if_nominal(self, zoom: float) -> str:
         for knot in self.usable:
@@ -348,22 +319,6 @@ class ZoomTable:
             raise ValueError(
                 f"{self.camera}: zoom units must run one way with the magnification, not {units}"
             )
-
-
-def _is_finite(*tensors: Tensor) -> bool:
-    return all(bool(tensor.isfinite().all()) for tensor in tensors)
-
-
-def _between(knots: Tensor, asked: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices (B,) of the knots around each value, and the weight (B,) of the one above.
-
-    Values beyond the knots (Z,), ascending, count as the outermost knot.
-    """
-    asked = asked.clamp(knots[0], knots[-1])
-    above = torch.searchsorted(knots, asked.detach(), right=True).clamp(max=len(knots) - 1)
-    below = (above - 1).clamp(min=0)
-    gap = torch.where(above > below, knots[above] - knots[below], 1.0)
-    return below, above, (asked - knots[below]) / gap
 
 
 def _status_name(status: object) -> str:

@@ -3,8 +3,22 @@
 Read by hand, knot ``k`` maps a picture point ``p`` to ``c + L(r) (p - c)`` with ``c`` its
 ``center``, ``L(r) = 1 + sum_i coefficients[i] r ** powers[i]`` and
 ``r = hypot(pixel_aspect (x - c_x), y - c_y) / scale``. ``zoom`` is the measured magnification,
-``nominal_zoom`` the one that was asked for. A null inside of ``covariance`` stands for infinity:
-what was not estimated is not known. ``systematic_covariance`` is to be added to it.
+``nominal_zoom`` the one that was asked for.
+
+Where the knot has ``focal_length_px`` and there is a ``principal_point``, the knot's own or else
+the table's, the undistorted point ``(u, v)`` is seen along the ray ``K^-1 (u, v, 1)`` of the camera
+frame (x right, y down, z forward), with the camera matrix ``K = [[f, 0, ppx],
+[0, f pixel_aspect, ppy], [0, 0, 1]]``. The camera centre is the entrance pupil, ``pupil_m`` metres
+ahead of the axes of the head.
+
+``covariance`` is of (cx px, cy px, coefficients), ``intrinsics_covariance`` of (cx px, cy px,
+coefficients, f px, ppx px, ppy px), with the former as its first block; ``systematic_covariance``
+is to be added to that block. A null inside of them stands for infinity: what was not estimated is
+not known. Between two knots all runs linearly with the logarithm of ``zoom``, the focal length by
+its own logarithm.
+
+Fields that came after the first tables may be missing and then are null, so that readers and files
+of one version understand each other.
 """
 
 from __future__ import annotations
@@ -16,9 +30,10 @@ from typing import TYPE_CHECKING
 
 from torchptz.files import without_nan, write_whole
 from torchptz.lens import RadialLens
+from torchptz.zoom_knot import COVARIANCES, Knot
 
 if TYPE_CHECKING:
-    from torchptz.zoom_table import Knot, ZoomTable
+    from torchptz.zoom_table import ZoomTable
 
 SCHEMA = "torchptz.zoom_table"
 SCHEMA_VERSION = 1
@@ -26,7 +41,11 @@ SCHEMA_VERSION = 1
 _MODEL = (
     "undistorted = c + L(r) (p - c); L(r) = 1 + sum_i coefficients[i] r^powers[i]; "
     "r = hypot(pixel_aspect (x - c_x), y - c_y) / scale; px, x right, y down, "
-    "(0, 0) is the centre of the top-left pixel"
+    "(0, 0) is the centre of the top-left pixel; "
+    "ray = K^-1 (undistorted, 1), x right, y down, z forward; "
+    "K = [[f, 0, ppx], [0, f pixel_aspect, ppy], [0, 0, 1]] with f = focal_length_px and "
+    "(ppx, ppy) = principal_point of the knot, or else of the table; "
+    "intrinsics_covariance: of (c_x, c_y, coefficients, f, ppx, ppy); null in it: not known"
 )
 _NUMBERS = (
     "nominal_zoom",
@@ -36,9 +55,15 @@ _NUMBERS = (
     "gain_sigma",
     "focal_length_px",
     "focal_length_sigma_px",
+    "pupil_m",
+    "pupil_sigma_m",
 )
 _COUNTS = ("points", "lines")
-COVARIANCES = ("covariance", "systematic_covariance")
+# Fields of a knot that the first tables lack.
+_LATER = (
+    *("systematic_covariance", "principal_point", "intrinsics_covariance"),
+    *("pupil_m", "pupil_sigma_m"),
+)
 
 
 def write_table(table: ZoomTable, path: str | Path) -> None:
@@ -63,6 +88,7 @@ def write_table(table: ZoomTable, path: str | Path) -> None:
                 "usable": knot.usable,
                 "center": None if knot.lens is None else knot.lens.center[0].tolist(),
                 "coefficients": None if knot.lens is None else knot.lens.coefficients[0].tolist(),
+                "principal_point": _list(knot.principal_point),
                 **{name: without_nan(_list(getattr(knot, name))) for name in COVARIANCES},
                 **{name: getattr(knot, name) for name in (*_NUMBERS, *_COUNTS)},
             }
@@ -72,19 +98,19 @@ def write_table(table: ZoomTable, path: str | Path) -> None:
     write_whole(path, _readable(stored) + "\n")
 
 
-def read_table(path: str | Path, table_type: type[ZoomTable], knot_type: type[Knot]) -> ZoomTable:
+def read_table(path: str | Path, table_type: type[ZoomTable]) -> ZoomTable:
     """Read what `write_table` wrote; see `ZoomTable.load`."""
     try:
         stored = json.loads(Path(path).read_text(encoding="utf-8"))
     except ValueError as error:  # neither text nor JSON
         raise ValueError(f"{path}: not a zoom table, not even JSON ({error})") from error
     try:
-        return _table(stored, table_type, knot_type)
+        return _table(stored, table_type)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
-def _table(stored: object, table_type: type[ZoomTable], knot_type: type[Knot]) -> ZoomTable:
+def _table(stored: object, table_type: type[ZoomTable]) -> ZoomTable:
     if not isinstance(stored, dict) or stored.get("schema") != SCHEMA:
         found = stored.get("schema") if isinstance(stored, dict) else type(stored).__name__
         raise ValueError(f"schema is {found!r}; a zoom table has {SCHEMA!r}")
@@ -98,7 +124,7 @@ def _table(stored: object, table_type: type[ZoomTable], knot_type: type[Knot]) -
         raise ValueError("knots must be a list")
     return table_type(
         camera=_text(stored, "camera", ""),
-        knots=tuple(_knot(knot, f"knots[{i}].", stored, knot_type) for i, knot in enumerate(knots)),
+        knots=tuple(_knot(knot, f"knots[{i}].", stored) for i, knot in enumerate(knots)),
         principal_point=_array(stored, "principal_point", "", (2,), optional=True),
         principal_point_covariance=_array(
             stored, "principal_point_covariance", "", (2, 2), optional=True
@@ -107,9 +133,10 @@ def _table(stored: object, table_type: type[ZoomTable], knot_type: type[Knot]) -
     )
 
 
-def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot:
+def _knot(knot: object, where: str, stored: dict) -> Knot:
     if not isinstance(knot, dict):
         raise ValueError(f"{where[:-1]} must be an object")
+    knot = dict.fromkeys(_LATER) | knot
     usable = _field(knot, "usable", where)
     if not isinstance(usable, bool):
         raise ValueError(f"{where}usable must be true or false, not {usable!r}")
@@ -125,19 +152,20 @@ def _knot(knot: object, where: str, stored: dict, knot_type: type[Knot]) -> Knot
             "image_size": _array(stored, "image_size", "", (2,)),
             "pixel_aspect": _array(stored, "pixel_aspect", "", ()),
         }
-        size = 2 + len(powers)
-        # Tables from before there were systematic ones lack them.
-        stated = {"systematic_covariance": None, **knot}
-        covariances = {name: _covariance(stated, name, where, size) for name in COVARIANCES}
+        covariances = {
+            name: _covariance(knot, name, where, count + len(powers))
+            for name, count in COVARIANCES.items()
+        }
     numbers = {name: _array(knot, name, where, (), optional=True) for name in _NUMBERS}
     counts = {name: _array(knot, name, where, (), optional=True) for name in _COUNTS}
     status, zoom = _text(knot, "status", where), _array(knot, "zoom", where, ())
     try:
-        return knot_type(
+        return Knot(
             zoom=zoom,
             lens=None if lens is None else RadialLens(**lens),
             status=status,
             usable=usable,
+            principal_point=_array(knot, "principal_point", where, (2,), optional=True),
             **covariances,
             **numbers,
             **{name: None if count is None else int(count) for name, count in counts.items()},

@@ -1,0 +1,170 @@
+"""`calibrate`: what heads read and cameras saw in, complete internal calibrations out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchptz.calibration import parameters as at
+from torchptz.calibration.calibration import Calibration
+from torchptz.calibration.marginal import Noise
+from torchptz.calibration.misfit import growth_of
+from torchptz.calibration.priors import Known, Priors, known_of
+from torchptz.calibration.problem import Problem
+from torchptz.calibration.refinement import Refined, inliers, refine
+from torchptz.calibration.start import start_of
+from torchptz.calibration.verdict import statuses
+from torchptz.lens import checked_powers
+from torchptz.observations import Observations
+
+_VAGUE_FOCAL = 0.5  # relative, about the start, where no prior tells: keeps a lone look solvable
+_FAR_ROUNDS, _NEAR_ROUNDS = 3, 4  # of 5 steps, until outliers can be told
+_SELECTIONS = 3  # times that inliers are chosen
+_CHUNK = 2**25  # numbers in the largest tensor of a part of the batch
+
+
+def calibrate(
+    observations: Observations,
+    priors: Priors | None = None,
+    powers: Sequence[float] = (1, 2, 3),
+    robust: bool = True,
+) -> Calibration:
+    """Complete internal calibration of every camera of a batch from the poses of its head.
+
+    Maximum likelihood in distorted pixels, both coordinates of every point, of each zoom's focal
+    length, lens, principal point and entrance pupil, and of the rays, tilt zero, boresight, roll
+    and backlash that the zooms of a camera share. Readings are noisy: what a stop's reading erred
+    by is marginalised, and how much that is, is learnt. Nothing about the head is believed without
+    a sigma; what the data cannot tell stays at its prior (`undetermined`).
+
+    Args:
+        observations: C cameras, all zooms and features together: the long end pins the head, and
+            the head pins the wide end.
+        priors: default `Priors()`.
+        powers: K positive, increasing powers of r in L.
+        robust: set outlying observations aside.
+
+    Returns:
+        Calibration. Cameras are independent: a bad one gets its own statuses and changes no
+        other's numbers.
+
+    Raises:
+        ValueError: priors or powers that do not fit.
+
+    Source: README, "Beyond the paper".
+    """
+    priors = priors or Priors()
+    exponents = checked_powers(powers)
+    problem = Problem.from_observations(observations, exponents)
+    known = known_of(priors, observations, problem.layout, problem.used)
+    noise = _assumed_noise(priors, observations)
+    size = 2 * problem.pixel.shape[1] * problem.layout.size
+    step = max(1, _CHUNK // max(1, size))
+    parts = [slice(begun, begun + step) for begun in range(0, len(observations), step)]
+    learn = not priors.reading_known
+    with torch.no_grad():
+        return Calibration.cat(
+            [
+                _calibrated(observations[p], problem[p], known[p], noise[p], learn, robust)
+                for p in parts
+            ]
+        )
+
+
+def _calibrated(
+    observations: Observations,
+    problem: Problem,
+    known: Known,
+    noise: Noise,
+    learn: bool,
+    robust: bool,
+) -> Calibration:
+    theta, known = _started(problem, observations, known, noise)
+    if robust:
+        # Before outliers are told from a start that is off, nothing is learnt from them.
+        far = refine(
+            problem, theta, known, noise, learn=False, heavy_tails=True, rounds=_FAR_ROUNDS
+        )
+        near = refine(
+            problem, far.theta, known, noise, learn=learn, heavy_tails=True, rounds=_NEAR_ROUNDS
+        )
+        taken = far.iterations + near.iterations
+        theta, noise = near.theta, near.noise
+        good = inliers(problem, near)
+    else:
+        good, taken = problem.used, torch.zeros_like(known.mean[:, 0], dtype=torch.long)
+    for _ in range(_SELECTIONS if robust else 1):
+        chosen = problem.using(good.to(problem.weight))
+        refined = refine(chosen, theta, known, noise, learn=learn)
+        taken = taken + refined.iterations
+        theta, noise = refined.theta, refined.noise
+        before, good = good, inliers(problem, refined) if robust else good
+        if bool((good == before).all()):
+            break
+    return _summed_up(observations, problem, chosen, known, replace(refined, iterations=taken))
+
+
+def _assumed_noise(priors: Priors, o: Observations) -> Noise:
+    """A head that stops anywhere and reports the nearest multiple of its quantum."""
+    repeatability = torch.as_tensor(priors.repeatability).to(o.quantum)
+    if repeatability.ndim == 1 and len(repeatability) == len(o):
+        repeatability = repeatability[:, None]
+    head = (o.quantum**2 / 12 + repeatability**2).clamp_min(_FINEST_READING**2)
+    return Noise(head.expand(len(o), 2), torch.ones_like(head[:, 0]))
+
+
+_FINEST_READING = 1e-6  # rad
+
+
+def _started(problem: Problem, o: Observations, known: Known, noise: Noise) -> tuple[Tensor, Known]:
+    """Start (C, T), and the priors with a vague one about it for focal lengths without any."""
+    theta = start_of(problem, o, known)
+    zooms, head, features = problem.layout.split(known.sigma)
+    untold = zooms[..., at.LOG_FOCAL].isinf()
+    mean_zooms, mean_head, mean_features = problem.layout.split(known.mean)
+    mean_zooms, zooms = mean_zooms.clone(), zooms.clone()
+    begun = problem.layout.split(theta)[0][..., at.LOG_FOCAL]
+    mean_zooms[..., at.LOG_FOCAL] = torch.where(untold, begun, mean_zooms[..., at.LOG_FOCAL])
+    zooms[..., at.LOG_FOCAL] = torch.where(untold, _VAGUE_FOCAL, zooms[..., at.LOG_FOCAL])
+    known = Known(
+        problem.layout.join(mean_zooms, mean_head, mean_features),
+        problem.layout.join(zooms, head, features),
+    )
+    return theta, known
+
+
+def _summed_up(
+    o: Observations, problem: Problem, chosen: Problem, known: Known, refined: Refined
+) -> Calibration:
+    layout = problem.layout
+    level = torch.arange(layout.zooms, device=o.zoom.device)
+    of_zoom = o.zoom.unsqueeze(1) == level[:, None]  # (C, Z, N)
+    seen = (of_zoom & problem.used.unsqueeze(1)).sum(2)
+    kept = (of_zoom & chosen.used.unsqueeze(1)).sum(2)
+    squares = refined.residual.square().sum(-1).unsqueeze(1)
+    rms = (torch.where(of_zoom & chosen.used.unsqueeze(1), squares, 0.0).sum(2) / (2 * kept)).sqrt()
+    calibration = Calibration(
+        camera=list(o.camera),
+        zooms=o.zooms,
+        exists=seen > 0,
+        image_size=o.image_size,
+        powers=problem.powers,
+        layout=layout,
+        theta=refined.theta,
+        covariance=refined.covariance,
+        growth=torch.ones_like(rms),
+        known=known,
+        reading_sigma=refined.noise.head.sqrt(),
+        noise_factor=refined.noise.pixel.sqrt(),
+        rms_px=rms,
+        residuals=torch.where(problem.used.unsqueeze(-1), refined.residual, 0.0),
+        distances=torch.where(problem.used, refined.distance.sqrt(), 0.0),
+        inliers=chosen.used,
+        iterations=refined.iterations,
+        status=[[] for _ in o.camera],
+    )
+    grown = replace(calibration, growth=growth_of(chosen, refined, known))
+    return replace(grown, status=statuses(calibration, grown, seen, kept, refined.converged))

@@ -1,0 +1,185 @@
+"""The errors of a head's readings, marginalised stop by stop.
+
+A stop's reading errs by the same two angles for every observation made there. With the derivatives
+B (n, 2) of its observations with respect to them, D (n, n) the noise in the picture and S (2, 2)
+that of the readings, they have the covariance C = D + B S B^T, and by Woodbury's identity
+
+    C^-1 = D^-1 - D^-1 B Q B^T D^-1,    Q = S (1 + G S)^-1,    G = B^T D^-1 B.
+
+Nothing larger than 2 x 2 is inverted per stop, and S may be 0: a head that reads the truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchptz.batch import Batched
+from torchptz.calibration.model import Prediction
+from torchptz.calibration.problem import Problem
+
+_SHRINK, _GROW = 0.03, 30.0  # of a variance, in one step
+FINEST = 1e-7  # rad: no head reads its position better
+
+
+@dataclass(frozen=True, eq=False)
+class Noise(Batched):
+    """How far observations are to be believed."""
+
+    head: Tensor  # (C, 2) rad², variance of a stop's pan and tilt
+    pixel: Tensor  # (C,) by which the squares of the stated sigmas are multiplied
+
+
+@dataclass(frozen=True, eq=False)
+class Metric(Batched):
+    """C^-1, and what the noise of the head is estimated from."""
+
+    precision: Tensor  # (C, N) 1 / px²; 0: not used
+    by_pose: Tensor  # (C, N, 2, 2) B
+    answer: Tensor  # (C, S, 2, 2) (1 + G S)^-1
+    information: Tensor  # (C, S, 2, 2) G
+    inner: Tensor  # (C, S, 2, 2) Q
+    stop_weight: Tensor  # (C, S)
+
+
+@dataclass(frozen=True, eq=False)
+class Normal(Batched):
+    """Normal equations of all unknowns, the poses eliminated."""
+
+    matrix: Tensor  # (C, T, T)
+    right: Tensor  # (C, T), minus half the gradient of the cost
+    to_stops: Tensor  # (C, S, 2, T), B^T D^-1 A
+
+
+def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
+    """The metric of observations with their present weights.
+
+    A weight is that of an observation's whole covariance; of a stop with several it is that of the
+    best of them, so that one wrong detection does not make a reading doubtful.
+
+    Args:
+        problem: C cameras.
+        by_pose: (C, N, 2, 2) px per rad.
+        noise: of picture and head.
+    """
+    precision = problem.weight / (problem.sigma**2 * noise.pixel[:, None])
+    information = problem.per_stop(by_pose.mT @ (by_pose * precision[..., None, None]))
+    weight = problem.weight.new_zeros(len(problem), problem.stops)
+    weight = weight.scatter_reduce(1, problem.stop, problem.weight, "amax")
+    weight = torch.where(weight > 0, weight, 1.0)
+    head = noise.head[:, None] / weight.unsqueeze(-1)  # (C, S, 2)
+    system = information * head.unsqueeze(-2)
+    system = system + torch.eye(2).to(system)
+    answer = _inverse(system)
+    return Metric(precision, by_pose, answer, information, head.unsqueeze(-1) * answer, weight)
+
+
+def at_stops(problem: Problem, metric: Metric, values: Tensor) -> Tensor:
+    """(C, S, 2, M) sums B^T D^-1 of values (C, N, 2, M)."""
+    return problem.per_stop(metric.by_pose.mT @ (values * metric.precision[..., None, None]))
+
+
+def cost(problem: Problem, metric: Metric, residual: Tensor) -> Tensor:
+    """(C,) squared residuals (C, N, 2) px in the metric: variances of 1 if the noise is right."""
+    plain = (metric.precision * residual.square().sum(-1)).sum(1)
+    pull = at_stops(problem, metric, residual.unsqueeze(-1))
+    return plain - (pull.mT @ metric.inner @ pull).sum((1, 2, 3))
+
+
+def normal_of(problem: Problem, metric: Metric, prediction: Prediction, residual: Tensor) -> Normal:
+    """Normal equations about a state."""
+    columns = dense(problem, prediction.by_theta)
+    weighted = columns * metric.precision[..., None, None]
+    to_stops = at_stops(problem, metric, columns)
+    pull = at_stops(problem, metric, residual.unsqueeze(-1))
+    through = (metric.inner @ to_stops).flatten(1, 2)
+    flat = to_stops.flatten(1, 2)
+    matrix = columns.flatten(1, 2).mT @ weighted.flatten(1, 2) - flat.mT @ through
+    right = (weighted * residual.unsqueeze(-1)).sum((1, 2)) - (
+        through.mT @ pull.flatten(1, 2)
+    ).squeeze(-1)
+    return Normal((matrix + matrix.mT) / 2, right, to_stops)
+
+
+def dense(problem: Problem, compact: Tensor) -> Tensor:
+    """(C, N, 2, T) derivatives by all unknowns, of those (C, N, 2, compact) that matter."""
+    index = problem.index.unsqueeze(2).expand_as(compact)
+    out = compact.new_zeros(*compact.shape[:3], problem.layout.size)
+    return out.scatter_(3, index, compact)
+
+
+def distances(problem: Problem, by_pose: Tensor, noise: Noise, residual: Tensor) -> Tensor:
+    """(C, N) squared standardised distance of every observation by itself, of weight or not."""
+    variance = problem.sigma**2 * noise.pixel[:, None]
+    covariance = by_pose @ (noise.head[:, None, :, None] * by_pose.mT)
+    covariance = covariance + variance[..., None, None] * torch.eye(2).to(covariance)
+    away = residual.unsqueeze(-1)
+    return (away.mT @ _inverse(covariance) @ away)[..., 0, 0]
+
+
+def learned_noise(
+    problem: Problem,
+    metric: Metric,
+    noise: Noise,
+    normal: Normal,
+    covariance: Tensor,
+    freedom: Tensor,
+    residual: Tensor,
+) -> Noise:
+    """A step towards the noise that makes the residuals most likely.
+
+    Args:
+        problem, metric, noise, normal: at the state.
+        covariance: (C, T, T) of the unknowns.
+        freedom: (C,) number of observed coordinates less that of the unknowns they determine.
+        residual: (C, N, 2) px.
+
+    Source: restricted maximum likelihood (Patterson and Thompson 1971) by Fisher scoring; the
+    information of a variance per stop is half the square of what the stop says of its pose.
+    """
+    share = 1 / metric.stop_weight.unsqueeze(-1)
+    pull = metric.answer @ at_stops(problem, metric, residual.unsqueeze(-1))
+    found = (pull[..., 0].square() * share).sum(1)  # (C, 2)
+    reach = metric.answer @ normal.to_stops  # (C, S, 2, T)
+    fitted = ((reach @ covariance[:, None]) * reach).sum(-1)
+    seen = metric.answer @ metric.information  # (C, S, 2, 2) of a stop's pose, in all
+    expected = ((seen.diagonal(dim1=-2, dim2=-1) - fitted) * share).sum(1)
+
+    head_found, head_expected = (noise.head * found).sum(1), (noise.head * expected).sum(1)
+    pixel_found = (cost(problem, metric, residual) - head_found).clamp_min(0)
+    pixel_expected = freedom - head_expected
+    # Of the logarithms: all of them of order 1.
+    score = torch.cat([noise.head * (found - expected), (pixel_found - pixel_expected)[:, None]], 1)
+    part = seen * (noise.head[:, None, None] * share.unsqueeze(-1))  # of the pose, by its noise
+    crossed = (part * part.mT).sum(1)  # (C, 2, 2)
+    own = (part.diagonal(dim1=-2, dim2=-1) - (part @ part).diagonal(dim1=-2, dim2=-1)).sum(1)
+    both = (part @ part).diagonal(dim1=-2, dim2=-1).sum((1, 2))
+    rest = 2 * problem.used.sum(1) - 2 * part.diagonal(dim1=-2, dim2=-1).sum((1, 2)) + both
+    system = torch.cat(
+        [
+            torch.cat([crossed, own.unsqueeze(-1)], 2),
+            torch.cat([own, rest[:, None]], 1).unsqueeze(1),
+        ],
+        1,
+    )
+    # What is at its least and wants to be less has no say in the others' steps.
+    least = torch.cat([noise.head <= 1.01 * FINEST**2, score[:, 2:] > torch.inf], 1) & (score < 0)
+    score = torch.where(least, 0.0, score)
+    system = torch.where(least[:, :, None] | least[:, None], 0.0, system)
+    # A variance that is next to nothing has no information about its own logarithm.
+    size = system.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
+    system = system / (size[:, :, None] * size[:, None]) + 1e-6 * torch.eye(3).to(system)
+    step = torch.linalg.solve_ex(system, (score / size).unsqueeze(-1)).result.squeeze(-1) / size
+    factor = (1 + step.nan_to_num(0.0)).clamp(_SHRINK, _GROW)
+    head = (noise.head * factor[:, :2]).clamp_min(FINEST**2)
+    return Noise(head, noise.pixel * factor[:, 2])
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """Inverse of (..., 2, 2)."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    determinant = a * d - b * c
+    rows = [torch.stack([d, -b], -1), torch.stack([-c, a], -1)]
+    return torch.stack(rows, -2) / determinant[..., None, None]

@@ -1,0 +1,98 @@
+"""Observations in the form in which the calibration works on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from torchptz.batch import Batched
+from torchptz.calibration.parameters import Layout
+from torchptz.geometry import wrap_angle
+from torchptz.observations import Observations
+
+
+@dataclass(frozen=True, eq=False)
+class Problem(Batched):
+    """Observations of C cameras, of which those with a weight count."""
+
+    layout: Layout
+    stops: int  # S, of the camera with the most
+    powers: Tensor  # (K,)
+    pixel: Tensor  # (C, N, 2) px
+    sigma: Tensor  # (C, N) px
+    weight: Tensor  # (C, N), 0: not used
+    zoom: Tensor  # (C, N) long
+    feature: Tensor  # (C, N) long
+    stop: Tensor  # (C, N) long
+    motor: Tensor  # (C, N, 2) rad, pan and tilt as read; pans without jumps on the circle
+    scale: Tensor  # (C,) px per unit of r
+    image_size: Tensor  # (C, 2) px
+
+    _shared: ClassVar[frozenset[str]] = frozenset({"layout", "stops", "powers"})
+
+    @classmethod
+    def from_observations(cls, observations: Observations, powers: Tensor) -> Problem:
+        """All that was found, each with a weight of 1."""
+        o = observations
+        layout = Layout(o.zooms.shape[1], max(1, o.features), len(powers))
+        used = o.found & o.mask & (o.sigma > 0)
+        used &= o.pixel.isfinite().all(-1) & o.read.isfinite().all(-1)
+        return cls(
+            layout,
+            int(o.stop.max()) + 1,
+            powers.to(o.pixel.device),
+            o.pixel,
+            o.sigma,
+            used.double(),
+            o.zoom,
+            o.feature,
+            o.stop,
+            _motor(o),
+            o.image_size[:, 0] / 2,
+            o.image_size,
+        )
+
+    @property
+    def used(self) -> Tensor:
+        """(C, N) bool."""
+        return self.weight > 0
+
+    @property
+    def index(self) -> Tensor:
+        """(C, N, compact) places in theta of what each observation depends on."""
+        return self.layout.index(self.zoom, self.feature)
+
+    def using(self, weight: Tensor) -> Problem:
+        """The same with other weights (C, N)."""
+        return replace(self, weight=weight)
+
+    def per_stop(self, values: Tensor) -> Tensor:
+        """(C, S, ...) sums of values (C, N, ...) over the observations of each stop."""
+        tail = values.shape[2:]
+        where = self.stop.reshape(*self.stop.shape, *[1] * len(tail)).expand_as(values)
+        return values.new_zeros(len(values), self.stops, *tail).scatter_add(1, where, values)
+
+    def of_stop(self, values: Tensor) -> Tensor:
+        """(C, N, ...) values (C, S, ...) of the stop of each observation."""
+        tail = values.shape[2:]
+        where = self.stop.reshape(*self.stop.shape, *[1] * len(tail))
+        return values.gather(1, where.expand(*self.stop.shape, *tail))
+
+
+def _motor(o: Observations) -> Tensor:
+    """(C, N, 2) mean reading of each stop; padding repeats what was read last."""
+    pan, tilt = torch.where(o.mask.unsqueeze(-1), o.read, 0.0).unbind(-1)
+    # Step by step on the circle, so that neither a mean nor the play sees a jump of a turn.
+    steps = torch.where(o.mask[:, 1:], wrap_angle(pan.diff(dim=1)), 0.0)
+    pan = torch.cat([pan[:, :1], pan[:, :1] + steps.cumsum(1)], 1)
+    motor = torch.stack([pan, torch.where(o.mask, tilt, 0.0)], -1)
+    count = o.mask.double()
+    stops = int(o.stop.max()) + 1
+    where = o.stop.unsqueeze(-1).expand_as(motor)
+    total = motor.new_zeros(len(motor), stops, 2).scatter_add(1, where, motor * count[..., None])
+    many = motor.new_zeros(len(motor), stops).scatter_add(1, o.stop, count)
+    mean = total / many.clamp_min(1).unsqueeze(-1)
+    return torch.where(o.mask.unsqueeze(-1), mean.gather(1, where), motor)

@@ -1,0 +1,267 @@
+"""Damped Gauss-Newton on all unknowns of a camera, and on the noise that weighs them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchptz.batch import Batched
+from torchptz.calibration import parameters as at
+from torchptz.calibration.marginal import (
+    Noise,
+    cost,
+    distances,
+    learned_noise,
+    metric_of,
+    normal_of,
+)
+from torchptz.calibration.model import predict
+from torchptz.calibration.priors import Known
+from torchptz.calibration.problem import Problem
+
+_ROUND = 5  # steps between two looks at which cameras are still active
+_MOST_ROUNDS = 16
+_DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
+# A step's promised fall of the cost is its squared length in standard deviations.
+_CONVERGED, _SETTLED = 1e-4, 1e-9
+_SETTLED_NOISE = 1e-3  # relative change of a variance that matters
+_HEAVY = 4.0  # degrees of freedom of the Student weights
+_MEDIAN = 1.386  # of chi squared with two degrees of freedom
+_INLIER = 25.0  # squared standard deviations, two degrees of freedom
+
+
+@dataclass(frozen=True, eq=False)
+class Refined(Batched):
+    """Where the iteration ended, per camera."""
+
+    theta: Tensor  # (C, T)
+    noise: Noise
+    weight: Tensor  # (C, N)
+    covariance: Tensor  # (C, T, T), 0 for what is held
+    distance: Tensor  # (C, N) squared standardised distance of every observation by itself
+    residual: Tensor  # (C, N, 2) px
+    cost: Tensor  # (C,)
+    freedom: Tensor  # (C,)
+    iterations: Tensor  # (C,)
+    converged: Tensor  # (C,) bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Progress(Batched):
+    theta: Tensor
+    noise: Noise
+    weight: Tensor
+    damping: Tensor
+    iterations: Tensor
+    converged: Tensor
+    active: Tensor
+
+
+def refine(
+    problem: Problem,
+    theta: Tensor,
+    known: Known,
+    noise: Noise,
+    *,
+    learn: bool = True,
+    heavy_tails: bool = False,
+    rounds: int = _MOST_ROUNDS,
+) -> Refined:
+    """The most likely unknowns, and the noise that makes the residuals most likely.
+
+    Each step takes the observations' covariance at the state as given: unlike a likelihood whose
+    covariance follows the unknowns, it does not find small residuals by making a zoom long and its
+    readings count less.
+
+    Args:
+        problem: C cameras.
+        theta: (C, T) start.
+        known: priors.
+        noise: start.
+        learn: whether the noise is learnt, too.
+        heavy_tails: weigh observations by how probable they are under Student's distribution, in
+            place of their weights; a start that is far off does no harm then, nor do outliers.
+        rounds: of 5 steps, at most.
+
+    Returns:
+        Refined. Damping, acceptance and the active mask are per camera.
+
+    Source: Levenberg and Marquardt; generalised estimating equations (Liang and Zeger 1986);
+    Student weights by Lange, Little and Taylor 1989.
+    """
+    cameras = len(theta)
+    progress = _Progress(
+        theta,
+        noise,
+        problem.weight,
+        torch.full_like(theta[:, 0], _DAMPING_START),
+        torch.zeros(cameras, dtype=torch.long, device=theta.device),
+        torch.zeros(cameras, dtype=torch.bool, device=theta.device),
+        problem.used.any(1),
+    )
+    for _ in range(rounds):
+        rows = progress.active.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        everyone = len(rows) == cameras
+        part = _advance(
+            *(problem, progress, known)
+            if everyone
+            else (problem[rows], progress[rows], known[rows]),
+            learn,
+            heavy_tails,
+        )
+        progress = part if everyone else progress.with_items(rows, part)
+    return _summed_up(problem.using(progress.weight), progress, known)
+
+
+def _advance(
+    problem: Problem, progress: _Progress, known: Known, learn: bool, heavy_tails: bool
+) -> _Progress:
+    """Up to 5 steps of every active camera, without a look at the result in between."""
+    theta, noise, weight = progress.theta, progress.noise, progress.weight
+    damping, iterations, active = progress.damping, progress.iterations, progress.active
+    converged, free, used = progress.converged, known.free, problem.used
+    for _ in range(_ROUND):
+        prediction = predict(problem, theta)
+        residual = _residual(problem, prediction.pixel)
+        spread = torch.ones_like(damping)
+        if heavy_tails:
+            squared = distances(problem, prediction.by_pose, noise, residual)
+            spread = _median(squared, used).div(_MEDIAN).clamp_min(1.0)
+            likely = (_HEAVY + 2) / (_HEAVY + squared / spread[:, None])
+            weight = torch.where(active[:, None], torch.where(used, likely, 0.0), weight)
+        weighed = problem.using(weight)
+        metric = metric_of(weighed, prediction.by_pose, noise)
+        normal = normal_of(weighed, metric, prediction, residual)
+        matrix = normal.matrix / spread[:, None, None] + torch.diag_embed(known.information)
+        right = normal.right / spread[:, None] + known.information * (known.mean - theta)
+        # A play of nothing that wants to be less stays where it is.
+        moves = free & ~(_stuck(problem, theta) & (right < 0))
+        matrix, right = held_out(matrix, moves), torch.where(moves, right, 0.0)
+        undamped = _solve(matrix, right, torch.zeros_like(damping))
+        promised = (right * undamped).sum(-1)
+        step = _solve(matrix, right, damping)
+        trial = _within(problem, theta + step)
+
+        level = cost(weighed, metric, residual) / spread + known.value(theta)
+        seen = _residual(problem, predict(problem, trial, derivatives=False).pixel)
+        trial_level = cost(weighed, metric, seen) / spread + known.value(trial)
+        better = active & (trial_level <= level + 1e-9 * (1 + level))
+        iterations = iterations + active
+        change = torch.zeros_like(damping)
+        if learn:
+            covariance = _of_free(inverse(matrix)[0], moves)
+            freedom = _freedom(problem, known, covariance)
+            wanted = learned_noise(weighed, metric, noise, normal, covariance, freedom, residual)
+            # A reading's variance matters only as far as it is seen in the picture.
+            visible = (metric.answer @ metric.information).diagonal(dim1=-2, dim2=-1)
+            share = (visible * noise.head[:, None]).mean(1)
+            change = ((wanted.head / noise.head).log().abs() * share).amax(1)
+            change = torch.maximum(change, (wanted.pixel / noise.pixel).log().abs())
+            noise = wanted.where(active, noise)
+        theta = torch.where(better[:, None], trial, theta)
+        damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
+        quiet = change < _SETTLED_NOISE
+        converged = torch.where(active, (promised < _CONVERGED) & quiet, converged)
+        active = active & ~((promised < _SETTLED) & quiet) & (damping < _DAMPING_HIGHEST)
+    return _Progress(theta, noise, weight, damping, iterations, converged, active)
+
+
+def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:
+    theta, noise = progress.theta, progress.noise
+    prediction = predict(problem, theta)
+    residual = _residual(problem, prediction.pixel)
+    metric = metric_of(problem, prediction.by_pose, noise)
+    normal = normal_of(problem, metric, prediction, residual)
+    matrix = held_out(normal.matrix + torch.diag_embed(known.information), known.free)
+    covariance, failed = inverse(matrix)
+    covariance = _of_free(covariance, known.free)
+    nothing = torch.diag_embed(torch.where(known.free, known.sigma**2, 0.0))
+    return Refined(
+        theta,
+        noise,
+        progress.weight,
+        torch.where(failed[:, None, None], nothing, covariance),
+        distances(problem, prediction.by_pose, noise, residual),
+        residual,
+        cost(problem, metric, residual),
+        _freedom(problem, known, covariance),
+        progress.iterations,
+        progress.converged & ~failed,
+    )
+
+
+def inliers(problem: Problem, refined: Refined) -> Tensor:
+    """(C, N) bool, observations that are where the others say."""
+    return problem.used & (refined.distance < _INLIER)
+
+
+def _residual(problem: Problem, pixel: Tensor) -> Tensor:
+    return torch.where(problem.used.unsqueeze(-1), problem.pixel - pixel, 0.0)
+
+
+def _freedom(problem: Problem, known: Known, covariance: Tensor) -> Tensor:
+    """(C,) observed coordinates less the unknowns that they, and not the priors, determine."""
+    told = known.information * covariance.diagonal(dim1=1, dim2=2)
+    determined = (known.free * (1 - told).clamp(0, 1)).sum(1)
+    return (2 * problem.used.sum(1) - determined).clamp_min(1.0)
+
+
+def _within(problem: Problem, theta: Tensor) -> Tensor:
+    """A play is not negative."""
+    zooms, head, features = problem.layout.split(theta)
+    head = head.clone()
+    head[:, at.BACKLASH] = head[:, at.BACKLASH].clamp_min(0)
+    return problem.layout.join(zooms, head, features)
+
+
+def _stuck(problem: Problem, theta: Tensor) -> Tensor:
+    """(C, T) bool, plays that are nothing."""
+    zooms, head, features = problem.layout.split(torch.zeros_like(theta, dtype=torch.bool))
+    head = head.clone()
+    head[:, at.BACKLASH] = problem.layout.split(theta)[1][:, at.BACKLASH] <= 0
+    return problem.layout.join(zooms, head, features)
+
+
+def _of_free(covariance: Tensor, free: Tensor) -> Tensor:
+    return torch.where(free[:, :, None] & free[:, None], covariance, 0.0)
+
+
+def held_out(matrix: Tensor, free: Tensor) -> Tensor:
+    """Normal matrix (C, T, T) with the unknowns that are not ``free`` (C, T) held."""
+    both = free[:, :, None] & free[:, None]
+    return torch.where(both, matrix, 0.0) + torch.diag_embed((~free).to(matrix))
+
+
+def _scaled(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """A matrix (C, T, T) with a diagonal of 1, and the roots (C, T) of what it was."""
+    size = matrix.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
+    return matrix / (size[:, :, None] * size[:, None]), size
+
+
+def _solve(matrix: Tensor, right: Tensor, damping: Tensor) -> Tensor:
+    """Marquardt's step (C, T); 0 where there is none."""
+    scaled, size = _scaled(matrix)
+    damped = scaled + torch.diag_embed(damping[:, None].expand_as(right) + 1e-14)
+    step = torch.linalg.solve_ex(damped, (right / size).unsqueeze(-1)).result.squeeze(-1) / size
+    return torch.where(step.isfinite().all(-1, keepdim=True), step, 0.0)
+
+
+def inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse (C, T, T) of positive definite matrices, and where there is none (C,)."""
+    finite = matrix.isfinite().all((1, 2))
+    identity = torch.eye(matrix.shape[-1]).to(matrix)
+    matrix = torch.where(finite[:, None, None], matrix, identity)
+    scaled, size = _scaled(matrix)
+    factor, failed = torch.linalg.cholesky_ex(scaled)
+    failed = (failed > 0) | ~finite
+    factor = torch.where(failed[:, None, None], identity, factor)
+    return torch.cholesky_inverse(factor) / (size[:, :, None] * size[:, None]), failed
+
+
+def _median(values: Tensor, used: Tensor) -> Tensor:
+    """(C,) median of those used; 0 where there are none."""
+    return torch.where(used, values, torch.nan).nanmedian(1).values.nan_to_num(0.0)
