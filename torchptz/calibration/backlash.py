@@ -28,31 +28,32 @@ def load_behind(motor: Tensor, play: Tensor) -> tuple[Tensor, Tensor]:
     low_slope, high_slope = torch.full_like(low, -0.5), torch.full_like(high, 0.5)
     reach, count = 1, motor.shape[-1]
     while reach < count:
-        # The clamps of the `reach` stops before, then those up to each stop.
-        before = (slice(None), slice(0, count - reach))
-        after = (slice(None), slice(reach, count))
-
-        def merged(bound: Tensor, slope: Tensor) -> tuple[Tensor, Tensor]:
-            earlier, earlier_slope = bound[..., before[1]], slope[..., before[1]]
-            floor, ceiling = low[..., after[1]], high[..., after[1]]
-            value = torch.minimum(torch.maximum(earlier, floor), ceiling)
-            gradient = torch.where(
-                earlier < floor,
-                low_slope[..., after[1]],
-                torch.where(earlier > ceiling, high_slope[..., after[1]], earlier_slope),
-            )
-            return (
-                torch.cat([bound[..., :reach], value], -1),
-                torch.cat([slope[..., :reach], gradient], -1),
-            )
-
-        (new_low, new_low_slope), (new_high, new_high_slope) = (
-            merged(low, low_slope),
-            merged(high, high_slope),
+        # To the clamps that reach back so far, those before them.
+        bounds = (
+            low[..., reach:],
+            high[..., reach:],
+            low_slope[..., reach:],
+            high_slope[..., reach:],
         )
-        low, high, low_slope, high_slope = new_low, new_high, new_low_slope, new_high_slope
+        before = low[..., :-reach], low_slope[..., :-reach]
+        above = high[..., :-reach], high_slope[..., :-reach]
+        (new_low, new_low_slope), (new_high, new_high_slope) = (
+            _clamped(*before, *bounds),
+            _clamped(*above, *bounds),
+        )
+        low = torch.cat([low[..., :reach], new_low], -1)
+        high = torch.cat([high[..., :reach], new_high], -1)
+        low_slope = torch.cat([low_slope[..., :reach], new_low_slope], -1)
+        high_slope = torch.cat([high_slope[..., :reach], new_high_slope], -1)
         reach *= 2
     start = motor[..., :1].expand_as(motor)
-    load = torch.minimum(torch.maximum(start, low), high)
-    slope = torch.where(start < low, low_slope, torch.where(start > high, high_slope, 0.0))
+    load, slope = _clamped(start, torch.zeros_like(motor), low, high, low_slope, high_slope)
     return load - motor, slope
+
+
+def _clamped(
+    value: Tensor, slope: Tensor, low: Tensor, high: Tensor, low_slope: Tensor, high_slope: Tensor
+) -> tuple[Tensor, Tensor]:
+    """A value moved between two bounds, and its slope."""
+    moved = torch.where(value < low, low_slope, torch.where(value > high, high_slope, slope))
+    return torch.minimum(torch.maximum(value, low), high), moved

@@ -21,7 +21,7 @@ from torchptz.lens import checked_powers
 from torchptz.observations import Observations
 
 _VAGUE_FOCAL = 0.5  # relative, about the start, where no prior tells: keeps a lone look solvable
-_FAR_ROUNDS, _NEAR_ROUNDS = 3, 4  # of 5 steps, until outliers can be told
+_ROUGH_ROUNDS, _SETTLED_ROUGHLY = 5, 0.1  # until outliers can be told
 _SELECTIONS = 3  # times that inliers are chosen
 _CHUNK = 2**25  # numbers in the largest tensor of a part of the batch
 
@@ -85,12 +85,9 @@ def _calibrated(
     theta, known = _started(problem, observations, known, noise)
     if robust:
         # Before outliers are told from a start that is off, nothing is learnt from them.
-        far = refine(
-            problem, theta, known, noise, learn=False, heavy_tails=True, rounds=_FAR_ROUNDS
-        )
-        near = refine(
-            problem, far.theta, known, noise, learn=learn, heavy_tails=True, rounds=_NEAR_ROUNDS
-        )
+        rough = {"heavy_tails": True, "settled": _SETTLED_ROUGHLY, "rounds": _ROUGH_ROUNDS}
+        far = refine(problem, theta, known, noise, learn=False, **rough)
+        near = refine(problem, far.theta, known, noise, learn=learn, **rough)
         taken = far.iterations + near.iterations
         theta, noise = near.theta, near.noise
         good = inliers(problem, near)

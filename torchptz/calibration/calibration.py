@@ -13,6 +13,7 @@ from torchptz.batch import Batched
 from torchptz.calibration import parameters as at
 from torchptz.calibration.parameters import Layout
 from torchptz.calibration.priors import Known
+from torchptz.calibration.undetermined import Undetermined, undetermined
 from torchptz.estimation.status import Status
 from torchptz.geometry import ray_from_pan_tilt
 from torchptz.lens import RadialLens
@@ -133,6 +134,11 @@ class Calibration(Batched):
     def distance_m(self) -> Tensor:
         """(C, F) m, of the features."""
         return 1 / self._features[..., 2]
+
+    @cached_property
+    def undetermined(self) -> list[list[Undetermined]]:
+        """Camera by camera what the observations did not tell, with what can be done about it."""
+        return undetermined(self)
 
     @cached_property
     def lens(self) -> RadialLens:

@@ -65,7 +65,7 @@ def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
         noise: of picture and head.
     """
     precision = problem.weight / (problem.sigma**2 * noise.pixel[:, None])
-    information = problem.per_stop(by_pose.mT @ (by_pose * precision[..., None, None]))
+    information = problem.per_stop(_product(by_pose.mT, by_pose * precision[..., None, None]))
     weight = problem.weight.new_zeros(len(problem), problem.stops)
     weight = weight.scatter_reduce(1, problem.stop, problem.weight, "amax")
     weight = torch.where(weight > 0, weight, 1.0)
@@ -78,14 +78,15 @@ def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
 
 def at_stops(problem: Problem, metric: Metric, values: Tensor) -> Tensor:
     """(C, S, 2, M) sums B^T D^-1 of values (C, N, 2, M)."""
-    return problem.per_stop(metric.by_pose.mT @ (values * metric.precision[..., None, None]))
+    weighted = values * metric.precision[..., None, None]
+    return problem.per_stop(_product(metric.by_pose.mT, weighted))
 
 
 def cost(problem: Problem, metric: Metric, residual: Tensor) -> Tensor:
     """(C,) squared residuals (C, N, 2) px in the metric: variances of 1 if the noise is right."""
     plain = (metric.precision * residual.square().sum(-1)).sum(1)
     pull = at_stops(problem, metric, residual.unsqueeze(-1))
-    return plain - (pull.mT @ metric.inner @ pull).sum((1, 2, 3))
+    return plain - (pull * _product(metric.inner, pull)).sum((1, 2, 3))
 
 
 def normal_of(problem: Problem, metric: Metric, prediction: Prediction, residual: Tensor) -> Normal:
@@ -94,7 +95,7 @@ def normal_of(problem: Problem, metric: Metric, prediction: Prediction, residual
     weighted = columns * metric.precision[..., None, None]
     to_stops = at_stops(problem, metric, columns)
     pull = at_stops(problem, metric, residual.unsqueeze(-1))
-    through = (metric.inner @ to_stops).flatten(1, 2)
+    through = _product(metric.inner, to_stops).flatten(1, 2)
     flat = to_stops.flatten(1, 2)
     matrix = columns.flatten(1, 2).mT @ weighted.flatten(1, 2) - flat.mT @ through
     right = (weighted * residual.unsqueeze(-1)).sum((1, 2)) - (
@@ -113,10 +114,10 @@ def dense(problem: Problem, compact: Tensor) -> Tensor:
 def distances(problem: Problem, by_pose: Tensor, noise: Noise, residual: Tensor) -> Tensor:
     """(C, N) squared standardised distance of every observation by itself, of weight or not."""
     variance = problem.sigma**2 * noise.pixel[:, None]
-    covariance = by_pose @ (noise.head[:, None, :, None] * by_pose.mT)
+    covariance = _product(by_pose, noise.head[:, None, :, None] * by_pose.mT)
     covariance = covariance + variance[..., None, None] * torch.eye(2).to(covariance)
     away = residual.unsqueeze(-1)
-    return (away.mT @ _inverse(covariance) @ away)[..., 0, 0]
+    return (away * _product(_inverse(covariance), away)).sum((-2, -1))
 
 
 def learned_noise(
@@ -140,11 +141,12 @@ def learned_noise(
     information of a variance per stop is half the square of what the stop says of its pose.
     """
     share = 1 / metric.stop_weight.unsqueeze(-1)
-    pull = metric.answer @ at_stops(problem, metric, residual.unsqueeze(-1))
+    pull = _product(metric.answer, at_stops(problem, metric, residual.unsqueeze(-1)))
     found = (pull[..., 0].square() * share).sum(1)  # (C, 2)
-    reach = metric.answer @ normal.to_stops  # (C, S, 2, T)
-    fitted = ((reach @ covariance[:, None]) * reach).sum(-1)
-    seen = metric.answer @ metric.information  # (C, S, 2, 2) of a stop's pose, in all
+    reach = _product(metric.answer, normal.to_stops)  # (C, S, 2, T)
+    fitted = ((reach.flatten(1, 2) @ covariance) * reach.flatten(1, 2)).sum(-1)
+    fitted = fitted.unflatten(1, reach.shape[1:3])
+    seen = _product(metric.answer, metric.information)  # (C, S, 2, 2) of a stop's pose, in all
     expected = ((seen.diagonal(dim1=-2, dim2=-1) - fitted) * share).sum(1)
 
     head_found, head_expected = (noise.head * found).sum(1), (noise.head * expected).sum(1)
@@ -154,8 +156,9 @@ def learned_noise(
     score = torch.cat([noise.head * (found - expected), (pixel_found - pixel_expected)[:, None]], 1)
     part = seen * (noise.head[:, None, None] * share.unsqueeze(-1))  # of the pose, by its noise
     crossed = (part * part.mT).sum(1)  # (C, 2, 2)
-    own = (part.diagonal(dim1=-2, dim2=-1) - (part @ part).diagonal(dim1=-2, dim2=-1)).sum(1)
-    both = (part @ part).diagonal(dim1=-2, dim2=-1).sum((1, 2))
+    twice = _product(part, part).diagonal(dim1=-2, dim2=-1)
+    own = (part.diagonal(dim1=-2, dim2=-1) - twice).sum(1)
+    both = twice.sum((1, 2))
     rest = 2 * problem.used.sum(1) - 2 * part.diagonal(dim1=-2, dim2=-1).sum((1, 2)) + both
     system = torch.cat(
         [
@@ -175,6 +178,12 @@ def learned_noise(
     factor = (1 + step.nan_to_num(0.0)).clamp(_SHRINK, _GROW)
     head = (noise.head * factor[:, :2]).clamp_min(FINEST**2)
     return Noise(head, noise.pixel * factor[:, 2])
+
+
+def _product(matrix: Tensor, columns: Tensor) -> Tensor:
+    """(..., 2, 2) times (..., 2, M). Thousands of such small products are no work for a BLAS."""
+    first, second = matrix.unbind(-1)
+    return first.unsqueeze(-1) * columns[..., :1, :] + second.unsqueeze(-1) * columns[..., 1:, :]
 
 
 def _inverse(matrix: Tensor) -> Tensor:

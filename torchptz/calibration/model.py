@@ -189,7 +189,7 @@ def _radius(target: Tensor, guess: Tensor, coefficients: Tensor, powers: Tensor)
     radius = torch.where(guess > 0, guess, target).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     both = torch.stack([coefficients, coefficients * (powers + 1)], -1)  # (C, N, K, 2)
     for _ in range(_NEWTON_STEPS):
-        value, slope = (_monomials(radius, powers).unsqueeze(-2) @ both).squeeze(-2).unbind(-1)
+        value, slope = (_monomials(radius, powers).unsqueeze(-1) * both).sum(-2).unbind(-1)
         radius = radius - (radius * (1 + value) - target) / (1 + slope).clamp_min(_FLATTEST)
         radius = radius.clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     return radius

@@ -13,6 +13,7 @@ from torchptz.calibration import parameters as at
 from torchptz.calibration.parameters import Layout
 from torchptz.observations import Observations
 
+_DEGREE = math.radians(1.0)
 _UNKNOWN_DISTANCE = 10.0  # m
 _UNKNOWN_DISTANCE_SIGMA = 0.05  # 1/m, of the nearness
 
@@ -64,13 +65,13 @@ class Priors:
     wander_sigma: Tensor | float = 3.0
     decentering_sigma: Tensor | float = 5.0
     coefficient_sigma: Tensor | float = 1.0
-    tilt_zero_sigma: Tensor | float = math.radians(1.0)
-    boresight_sigma: Tensor | float = math.radians(1.0)
-    roll_sigma: Tensor | float = math.radians(2.0)
+    tilt_zero_sigma: Tensor | float = _DEGREE
+    boresight_sigma: Tensor | float = _DEGREE
+    roll_sigma: Tensor | float = 2 * _DEGREE
     pixel_aspect: Tensor | float = 1.0
     pixel_aspect_sigma: Tensor | float = 0.0
     axis_scale_sigma: Tensor | float = 0.0
-    backlash_sigma: Tensor | float = math.radians(0.1)
+    backlash_sigma: Tensor | float = 0.1 * _DEGREE
     pupil_m: Tensor | float = 0.0
     pupil_sigma_m: Tensor | float = 0.05
     distance_m: Tensor | float | None = None

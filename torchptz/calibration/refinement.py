@@ -24,6 +24,7 @@ from torchptz.calibration.problem import Problem
 _ROUND = 5  # steps between two looks at which cameras are still active
 _MOST_ROUNDS = 16
 _DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
+_DAMPING_AT_KINK = 5.0
 # A step's promised fall of the cost is its squared length in standard deviations.
 _CONVERGED, _SETTLED = 1e-4, 1e-9
 _SETTLED_NOISE = 1e-3  # relative change of a variance that matters
@@ -57,6 +58,7 @@ class _Progress(Batched):
     iterations: Tensor
     converged: Tensor
     active: Tensor
+    play_held: Tensor  # (C,) bool
 
 
 def refine(
@@ -67,6 +69,7 @@ def refine(
     *,
     learn: bool = True,
     heavy_tails: bool = False,
+    settled: float = _SETTLED,
     rounds: int = _MOST_ROUNDS,
 ) -> Refined:
     """The most likely unknowns, and the noise that makes the residuals most likely.
@@ -83,6 +86,7 @@ def refine(
         learn: whether the noise is learnt, too.
         heavy_tails: weigh observations by how probable they are under Student's distribution, in
             place of their weights; a start that is far off does no harm then, nor do outliers.
+        settled: squared length, in standard deviations, of a step that is not worth while.
         rounds: of 5 steps, at most.
 
     Returns:
@@ -100,6 +104,7 @@ def refine(
         torch.zeros(cameras, dtype=torch.long, device=theta.device),
         torch.zeros(cameras, dtype=torch.bool, device=theta.device),
         problem.used.any(1),
+        torch.zeros(cameras, dtype=torch.bool, device=theta.device),
     )
     for _ in range(rounds):
         rows = progress.active.nonzero()[:, 0]
@@ -112,18 +117,25 @@ def refine(
             else (problem[rows], progress[rows], known[rows]),
             learn,
             heavy_tails,
+            settled,
         )
         progress = part if everyone else progress.with_items(rows, part)
     return _summed_up(problem.using(progress.weight), progress, known)
 
 
 def _advance(
-    problem: Problem, progress: _Progress, known: Known, learn: bool, heavy_tails: bool
+    problem: Problem,
+    progress: _Progress,
+    known: Known,
+    learn: bool,
+    heavy_tails: bool,
+    settled: float,
 ) -> _Progress:
     """Up to 5 steps of every active camera, without a look at the result in between."""
     theta, noise, weight = progress.theta, progress.noise, progress.weight
     damping, iterations, active = progress.damping, progress.iterations, progress.active
     converged, free, used = progress.converged, known.free, problem.used
+    play_held, plays = progress.play_held, _plays(problem, theta)
     for _ in range(_ROUND):
         prediction = predict(problem, theta)
         residual = _residual(problem, prediction.pixel)
@@ -138,8 +150,9 @@ def _advance(
         normal = normal_of(weighed, metric, prediction, residual)
         matrix = normal.matrix / spread[:, None, None] + torch.diag_embed(known.information)
         right = normal.right / spread[:, None] + known.information * (known.mean - theta)
-        # A play of nothing that wants to be less stays where it is.
-        moves = free & ~(_stuck(problem, theta) & (right < 0))
+        # A play of nothing that wants to be less stays where it is. So does one at a kink: where it
+        # is as wide as a step of the head, another step begins to take it up or ceases to.
+        moves = free & ~(plays & (((theta <= 0) & (right < 0)) | play_held[:, None]))
         matrix, right = held_out(matrix, moves), torch.where(moves, right, 0.0)
         undamped = _solve(matrix, right, torch.zeros_like(damping))
         promised = (right * undamped).sum(-1)
@@ -157,17 +170,20 @@ def _advance(
             freedom = _freedom(problem, known, covariance)
             wanted = learned_noise(weighed, metric, noise, normal, covariance, freedom, residual)
             # A reading's variance matters only as far as it is seen in the picture.
-            visible = (metric.answer @ metric.information).diagonal(dim1=-2, dim2=-1)
+            visible = (metric.answer * metric.information.mT).sum(-1)
             share = (visible * noise.head[:, None]).mean(1)
             change = ((wanted.head / noise.head).log().abs() * share).amax(1)
             change = torch.maximum(change, (wanted.pixel / noise.pixel).log().abs())
             noise = wanted.where(active, noise)
         theta = torch.where(better[:, None], trial, theta)
         damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
+        kink = active & ~play_held & (damping > _DAMPING_AT_KINK)
+        play_held = play_held | kink
+        damping = torch.where(kink, _DAMPING_START, damping)
         quiet = change < _SETTLED_NOISE
         converged = torch.where(active, (promised < _CONVERGED) & quiet, converged)
-        active = active & ~((promised < _SETTLED) & quiet) & (damping < _DAMPING_HIGHEST)
-    return _Progress(theta, noise, weight, damping, iterations, converged, active)
+        active = active & ~((promised < settled) & quiet) & (damping < _DAMPING_HIGHEST)
+    return _Progress(theta, noise, weight, damping, iterations, converged, active, play_held)
 
 
 def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:
@@ -218,11 +234,11 @@ def _within(problem: Problem, theta: Tensor) -> Tensor:
     return problem.layout.join(zooms, head, features)
 
 
-def _stuck(problem: Problem, theta: Tensor) -> Tensor:
-    """(C, T) bool, plays that are nothing."""
+def _plays(problem: Problem, theta: Tensor) -> Tensor:
+    """(C, T) bool, which of the unknowns are plays."""
     zooms, head, features = problem.layout.split(torch.zeros_like(theta, dtype=torch.bool))
     head = head.clone()
-    head[:, at.BACKLASH] = problem.layout.split(theta)[1][:, at.BACKLASH] <= 0
+    head[:, at.BACKLASH] = True
     return problem.layout.join(zooms, head, features)
 
 

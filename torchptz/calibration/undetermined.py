@@ -1,0 +1,136 @@
+"""What a calibration leaves open, and what a person can do about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from torchptz.calibration import parameters as at
+
+if TYPE_CHECKING:
+    from torchptz.calibration.calibration import Calibration
+
+# A sigma that the observations brought down to no less than this part of the prior's is the prior's.
+_LEFT = 0.7
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """Something that the observations did not tell."""
+
+    name: str
+    zooms: tuple[float, ...]  # nominal magnifications it belongs to; none: the camera
+    sigma: float | None  # what is left of it, in its unit; None: nobody can know it
+    unit: str
+    advice: str
+
+    def __str__(self) -> str:
+        where = f" at {', '.join(f'{zoom:g}x' for zoom in self.zooms)}" if self.zooms else ""
+        known = "" if self.sigma is None else f" known to {self.sigma:.2g} {self.unit} only"
+        return f"{self.name}{where}{known}: {self.advice}"
+
+
+_HEAD_ADVICE = {
+    "tilt zero": "let the feature be seen from more tilts, far apart, at the wide end",
+    "boresight": "let the feature be seen all over the picture at the wide end",
+    "roll": "let the feature be seen all over the picture",
+    "pan scale": "turn the head farther, with a second feature far aside",
+    "tilt scale": "turn the head farther, with a second feature at another tilt",
+    "pixel aspect": "let the feature be seen all over the picture, or state the aspect",
+    "pan backlash": "poses were approached from one side only, where it does no harm",
+    "tilt backlash": "poses were approached from one side only, where it does no harm",
+}
+_DEGREES = ("tilt zero", "boresight", "roll", "pan backlash", "tilt backlash")
+_GAUGES = (
+    Undetermined(
+        "pan zero",
+        (),
+        None,
+        "",
+        "the head's own zero is taken; another one would turn the features' rays and change no lens",
+    ),
+    Undetermined(
+        "tilt zero and the optical axis' turn about the tilt axis",
+        (),
+        None,
+        "",
+        "they are one rotation and only their sum exists, here as the tilt zero",
+    ),
+)
+
+
+def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
+    """Camera by camera what stayed at its prior, and what no observation can tell.
+
+    Args:
+        calibration: of C cameras.
+    """
+    layout = calibration.layout
+    sigma = calibration.covariance.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt()
+    prior = calibration.known.sigma
+    left = (prior > 0) & prior.isfinite() & (sigma > _LEFT * prior)
+    parts = [layout.split(one) for one in (left, sigma)]
+    (zoom_left, head_left, feature_left), (zoom_sigma, head_sigma, feature_sigma) = (
+        [part.cpu() for part in one] for one in parts
+    )
+    relative = (calibration.focal_length_sigma / calibration.focal_length).cpu()
+    distance = calibration.distance_m.cpu()
+    exists = calibration.exists.cpu()
+    found = []
+    for c in range(len(calibration)):
+        zooms = exists[c].nonzero()[:, 0].tolist()
+        name = {z: float(calibration.zooms[c, z]) for z in zooms}
+        one = []
+        pupils = [z for z in zooms if zoom_left[c, z, layout.pupil]]
+        if pupils:
+            worst = max(float(relative[c, z]) for z in pupils)
+            one.append(
+                Undetermined(
+                    "entrance pupil",
+                    tuple(name[z] for z in pupils),
+                    max(float(zoom_sigma[c, z, layout.pupil]) for z in pupils),
+                    "m",
+                    "over the feature's distance it looks like a longer focal length, which is "
+                    f"known to {100 * worst:.2g} % for it: take a feature farther away, or two at "
+                    "clearly different known distances, or state where the pupil is (pupil_m)",
+                )
+            )
+        focal = [z for z in zooms if zoom_left[c, z, at.LOG_FOCAL]]
+        if focal:
+            one.append(
+                Undetermined(
+                    "focal length",
+                    tuple(name[z] for z in focal),
+                    100 * max(float(relative[c, z]) for z in focal),
+                    "%",
+                    "scan more of the picture, or a head that reads its position better",
+                )
+            )
+        for number, what in enumerate(at.HEAD):
+            if what in _HEAD_ADVICE and head_left[c, number]:
+                value = float(head_sigma[c, number])
+                degrees = what in _DEGREES
+                one.append(
+                    Undetermined(
+                        what,
+                        (),
+                        math.degrees(value) if degrees else 100 * value,
+                        "degrees" if degrees else "%",
+                        _HEAD_ADVICE[what],
+                    )
+                )
+        for feature in feature_left[c, :, 2].nonzero()[:, 0].tolist():
+            away = float(distance[c, feature])
+            one.append(
+                Undetermined(
+                    f"distance of feature {feature}",
+                    (),
+                    float(feature_sigma[c, feature, 2]) * away**2,
+                    "m",
+                    "it matters as far as the entrance pupil does: measure it, and state it "
+                    "(distance_m)",
+                )
+            )
+        found.append([*one, *_GAUGES])
+    return found
