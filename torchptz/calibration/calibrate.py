@@ -83,11 +83,12 @@ def _calibrated(
     robust: bool,
 ) -> Calibration:
     theta, known = _started(problem, observations, known, noise)
+    assumed = noise if learn else None
     if robust:
         # Before outliers are told from a start that is off, nothing is learnt from them.
         rough = {"heavy_tails": True, "settled": _SETTLED_ROUGHLY, "rounds": _ROUGH_ROUNDS}
-        far = refine(problem, theta, known, noise, learn=False, **rough)
-        near = refine(problem, far.theta, known, noise, learn=learn, **rough)
+        far = refine(problem, theta, known, noise, **rough)
+        near = refine(problem, far.theta, known, noise, assumed=assumed, **rough)
         taken = far.iterations + near.iterations
         theta, noise = near.theta, near.noise
         good = inliers(problem, near)
@@ -95,7 +96,7 @@ def _calibrated(
         good, taken = problem.used, torch.zeros_like(known.mean[:, 0], dtype=torch.long)
     for _ in range(_SELECTIONS if robust else 1):
         chosen = problem.using(good.to(problem.weight))
-        refined = refine(chosen, theta, known, noise, learn=learn)
+        refined = refine(chosen, theta, known, noise, assumed=assumed)
         taken = taken + refined.iterations
         theta, noise = refined.theta, refined.noise
         before, good = good, inliers(problem, refined) if robust else good
@@ -117,20 +118,43 @@ _FINEST_READING = 1e-6  # rad
 
 
 def _started(problem: Problem, o: Observations, known: Known, noise: Noise) -> tuple[Tensor, Known]:
+    """Start (C, T), and the priors about it.
+
+    Where the scale of an axis is open, so is its sign: the four ways are tried, and that which the
+    observations fit best is taken.
+    """
+    layout = problem.layout
+    axes = layout.zooms * layout.per_zoom + torch.arange(len(at.HEAD), device=o.zoom.device)
+    axes = axes[at.AXIS_SCALE]
+    theta, about = _start_with_priors(problem, o, known)
+    open_axes = known.free[:, axes]  # (C, 2)
+    if not bool(open_axes.any()):
+        return theta, about
+    best = torch.full_like(theta[:, 0], torch.inf)
+    for signs in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)):
+        turned = torch.where(open_axes, torch.tensor(signs).to(theta), 1.0)
+        mean = known.mean.index_copy(1, axes, known.mean[:, axes] * turned)
+        begun, priors = _start_with_priors(problem, o, replace(known, mean=mean))
+        tried = refine(problem, begun, priors, noise, heavy_tails=True, rounds=2)
+        away = torch.where(problem.used, tried.distance, torch.nan).nanmedian(1).values
+        better = away.nan_to_num(torch.inf) < best
+        best = torch.where(better, away, best)
+        theta = torch.where(better[:, None], begun, theta)
+        about = priors.where(better, about)
+    return theta, about
+
+
+def _start_with_priors(problem: Problem, o: Observations, known: Known) -> tuple[Tensor, Known]:
     """Start (C, T), and the priors with a vague one about it for focal lengths without any."""
     theta = start_of(problem, o, known)
-    zooms, head, features = problem.layout.split(known.sigma)
-    untold = zooms[..., at.LOG_FOCAL].isinf()
-    mean_zooms, mean_head, mean_features = problem.layout.split(known.mean)
-    mean_zooms, zooms = mean_zooms.clone(), zooms.clone()
-    begun = problem.layout.split(theta)[0][..., at.LOG_FOCAL]
-    mean_zooms[..., at.LOG_FOCAL] = torch.where(untold, begun, mean_zooms[..., at.LOG_FOCAL])
-    zooms[..., at.LOG_FOCAL] = torch.where(untold, _VAGUE_FOCAL, zooms[..., at.LOG_FOCAL])
-    known = Known(
-        problem.layout.join(mean_zooms, mean_head, mean_features),
-        problem.layout.join(zooms, head, features),
+    level = torch.arange(problem.layout.zooms, device=theta.device) * problem.layout.per_zoom
+    level = level + at.LOG_FOCAL
+    untold = known.sigma[:, level].isinf()
+    mean = torch.where(untold, theta[:, level], known.mean[:, level])
+    sigma = torch.where(untold, _VAGUE_FOCAL, known.sigma[:, level])
+    return theta, Known(
+        known.mean.index_copy(1, level, mean), known.sigma.index_copy(1, level, sigma)
     )
-    return theta, known
 
 
 def _summed_up(

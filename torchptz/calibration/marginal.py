@@ -20,8 +20,8 @@ from torchptz.batch import Batched
 from torchptz.calibration.model import Prediction
 from torchptz.calibration.problem import Problem
 
-_SHRINK, _GROW = 0.03, 30.0  # of a variance, in one step
-FINEST = 1e-7  # rad: no head reads its position better
+_HEAD_FACTOR, _PIXEL_FACTOR = 10.0, 2.0  # of a sigma, one standard deviation
+_FARTHEST = 3.0  # step of the logarithm of a variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +128,20 @@ def learned_noise(
     covariance: Tensor,
     freedom: Tensor,
     residual: Tensor,
+    assumed: Noise,
 ) -> Noise:
     """A step towards the noise that makes the residuals most likely.
+
+    Where every stop was looked at once, at one zoom, the noise of the picture and that of the head
+    can hardly be told apart: weak priors keep both within reason.
 
     Args:
         problem, metric, noise, normal: at the state.
         covariance: (C, T, T) of the unknowns.
         freedom: (C,) number of observed coordinates less that of the unknowns they determine.
         residual: (C, N, 2) px.
+        assumed: noise that is taken for right within a factor of about 2 in the picture and of 10
+            at the head, one standard deviation.
 
     Source: restricted maximum likelihood (Patterson and Thompson 1971) by Fisher scoring; the
     information of a variance per stop is half the square of what the stop says of its pose.
@@ -167,17 +173,18 @@ def learned_noise(
         ],
         1,
     )
-    # What is at its least and wants to be less has no say in the others' steps.
-    least = torch.cat([noise.head <= 1.01 * FINEST**2, score[:, 2:] > torch.inf], 1) & (score < 0)
-    score = torch.where(least, 0.0, score)
-    system = torch.where(least[:, :, None] | least[:, None], 0.0, system)
-    # A variance that is next to nothing has no information about its own logarithm.
+    # A variance that is hardly seen yet wants to be less falls as fast as its score does.
+    system = system + torch.diag_embed((-score).clamp_min(0))
+    # Twice the logarithm of the priors' densities, as of the likelihood's.
+    away = torch.cat([noise.head / assumed.head, (noise.pixel / assumed.pixel)[:, None]], 1).log()
+    spread = torch.tensor([_HEAD_FACTOR, _HEAD_FACTOR, _PIXEL_FACTOR]).to(away).log().mul(2)
+    score = score - 2 * away / spread**2
+    system = system + torch.diag(2 / spread**2)
     size = system.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
-    system = system / (size[:, :, None] * size[:, None]) + 1e-6 * torch.eye(3).to(system)
+    system = system / (size[:, :, None] * size[:, None])
     step = torch.linalg.solve_ex(system, (score / size).unsqueeze(-1)).result.squeeze(-1) / size
-    factor = (1 + step.nan_to_num(0.0)).clamp(_SHRINK, _GROW)
-    head = (noise.head * factor[:, :2]).clamp_min(FINEST**2)
-    return Noise(head, noise.pixel * factor[:, 2])
+    factor = step.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST).exp()
+    return Noise(noise.head * factor[:, :2], noise.pixel * factor[:, 2])
 
 
 def _product(matrix: Tensor, columns: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ def refine(
     known: Known,
     noise: Noise,
     *,
-    learn: bool = True,
+    assumed: Noise | None = None,
     heavy_tails: bool = False,
     settled: float = _SETTLED,
     rounds: int = _MOST_ROUNDS,
@@ -83,7 +83,7 @@ def refine(
         theta: (C, T) start.
         known: priors.
         noise: start.
-        learn: whether the noise is learnt, too.
+        assumed: what the noise is sought about; None: it is known and not learnt.
         heavy_tails: weigh observations by how probable they are under Student's distribution, in
             place of their weights; a start that is far off does no harm then, nor do outliers.
         settled: squared length, in standard deviations, of a step that is not worth while.
@@ -115,9 +115,9 @@ def refine(
             *(problem, progress, known)
             if everyone
             else (problem[rows], progress[rows], known[rows]),
-            learn,
             heavy_tails,
             settled,
+            assumed if everyone or assumed is None else assumed[rows],
         )
         progress = part if everyone else progress.with_items(rows, part)
     return _summed_up(problem.using(progress.weight), progress, known)
@@ -127,9 +127,9 @@ def _advance(
     problem: Problem,
     progress: _Progress,
     known: Known,
-    learn: bool,
     heavy_tails: bool,
     settled: float,
+    assumed: Noise | None,
 ) -> _Progress:
     """Up to 5 steps of every active camera, without a look at the result in between."""
     theta, noise, weight = progress.theta, progress.noise, progress.weight
@@ -165,10 +165,12 @@ def _advance(
         better = active & (trial_level <= level + 1e-9 * (1 + level))
         iterations = iterations + active
         change = torch.zeros_like(damping)
-        if learn:
+        if assumed is not None:
             covariance = _of_free(inverse(matrix)[0], moves)
             freedom = _freedom(problem, known, covariance)
-            wanted = learned_noise(weighed, metric, noise, normal, covariance, freedom, residual)
+            wanted = learned_noise(
+                weighed, metric, noise, normal, covariance, freedom, residual, assumed
+            )
             # A reading's variance matters only as far as it is seen in the picture.
             visible = (metric.answer * metric.information.mT).sum(-1)
             share = (visible * noise.head[:, None]).mean(1)

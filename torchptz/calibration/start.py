@@ -81,7 +81,7 @@ def _rays(problem: Problem, focal: Tensor, head: Tensor, features: int) -> Tenso
         [torch.ones_like(own), (-head[:, at.LOG_ASPECT, None]).exp().expand_as(own)], -1
     )
     away = (problem.pixel - head[:, None, at.POINT]) * square / own.unsqueeze(-1)
-    pan, tilt = problem.motor.unbind(-1)
+    pan, tilt = (problem.motor * head[:, None, at.AXIS_SCALE]).unbind(-1)
     rays = ray_through_pixel(pan, tilt, away)  # (C, N, 3)
     each = torch.arange(features, device=focal.device)[:, None]
     there = problem.used[:, None] & (problem.feature[:, None] == each)  # (C, F, N)

@@ -11,8 +11,9 @@ from torchptz.calibration import parameters as at
 if TYPE_CHECKING:
     from torchptz.calibration.calibration import Calibration
 
-# A sigma that the observations brought down to no less than this part of the prior's is the prior's.
+# A sigma that is no less than this part of the prior's is the prior's.
 _LEFT = 0.7
+_MATTERS = 5e-4  # relative error of a focal length
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ _GAUGES = (
         (),
         None,
         "",
-        "the head's own zero is taken; another one would turn the features' rays and change no lens",
+        "the head's own zero is taken; another one would turn the features' rays, and no lens",
     ),
     Undetermined(
         "tilt zero and the optical axis' turn about the tilt axis",
@@ -84,15 +85,16 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
         one = []
         pupils = [z for z in zooms if zoom_left[c, z, layout.pupil]]
         if pupils:
-            worst = max(float(relative[c, z]) for z in pupils)
+            nearest = float((1 / distance[c]).max())
+            worst = nearest * max(float(zoom_sigma[c, z, layout.pupil]) for z in pupils)
             one.append(
                 Undetermined(
                     "entrance pupil",
                     tuple(name[z] for z in pupils),
                     max(float(zoom_sigma[c, z, layout.pupil]) for z in pupils),
                     "m",
-                    "over the feature's distance it looks like a longer focal length, which is "
-                    f"known to {100 * worst:.2g} % for it: take a feature farther away, or two at "
+                    "over the feature's distance it looks like a longer focal length, which it "
+                    f"leaves open by {100 * worst:.2g} %: take a feature farther away, or two at "
                     "clearly different known distances, or state where the pupil is (pupil_m)",
                 )
             )
@@ -120,8 +122,11 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
                         _HEAD_ADVICE[what],
                     )
                 )
+        farthest = calibration.pupil_m[c].abs().nan_to_num(0.0).max().item()
         for feature in feature_left[c, :, 2].nonzero()[:, 0].tolist():
             away = float(distance[c, feature])
+            if farthest * float(feature_sigma[c, feature, 2]) < _MATTERS:
+                continue
             one.append(
                 Undetermined(
                     f"distance of feature {feature}",
