@@ -12,8 +12,11 @@ from torch import Tensor
 
 from torchptz.batch import Batched
 from torchptz.files import read_arrays, whole_file
+from torchptz.geometry import project, to_camera
+from torchptz.patterns import LinePatterns
 
 SCHEMA_VERSION = 1
+_FEWEST_ON_LINE = 3
 
 # Per camera, per observation: the last axes, and what stands where there is none.
 _COLUMNS: dict[str, tuple[tuple[int, ...], object]] = {
@@ -145,6 +148,61 @@ class Observations(Batched):
             out.append({"camera": name, **one})
         return out
 
+    def line_patterns(
+        self,
+        ray: Tensor,
+        focal_length: Tensor,
+        principal_point: Tensor,
+        pixel_aspect: Tensor | float = 1.0,
+    ) -> tuple[LinePatterns, Tensor]:
+        """The image lines that were scanned, for `estimate`, which trusts the head's geometry.
+
+        Which line was meant is found again from the readings: of the places where an undistorted
+        picture would show the feature at them, it is the line nearest to all, and how far beside
+        it each lies is its known offset. Another line would take up the difference: lines are free.
+
+        Args:
+            ray: (C, F, 3) of the features.
+            focal_length: (C, Z) px, roughly.
+            principal_point: (C, 2) px.
+            pixel_aspect: width over height of a pixel, one or (C,).
+
+        Returns:
+            Patterns of the I pairs of camera and zoom with lines of at least 3 points, and (I, 2)
+            indices of these pairs.
+
+        Raises:
+            ValueError: no such line at all.
+        """
+        rays = ray.gather(1, self.feature.unsqueeze(-1).expand(*self.feature.shape, 3))
+        image = project(to_camera(rays, *self.read.unbind(-1)))
+        aspect = torch.as_tensor(pixel_aspect).to(image).expand(len(self))
+        square = torch.stack([torch.ones_like(aspect), aspect], -1)
+        focal = focal_length.gather(1, self.zoom)
+        ideal = principal_point[:, None] + focal.unsqueeze(-1) * square[:, None] * image
+        there = self.mask & self.found & (self.line >= 0) & ideal.isfinite().all(-1)
+        columns = torch.stack([self.zoom, self.line], -1)
+        points, offsets, sigmas, pairs = [], [], [], []
+        for camera in range(len(self)):
+            rows = there[camera].nonzero()[:, 0]
+            keys, line_of = columns[camera, rows].unique(dim=0, return_inverse=True)
+            for number, (zoom, _) in enumerate(keys.tolist()):
+                line = rows[line_of == number]
+                if len(line) < _FEWEST_ON_LINE:
+                    continue
+                if not pairs or pairs[-1] != [camera, zoom]:
+                    pairs.append([camera, zoom])
+                    points.append([]), offsets.append([]), sigmas.append([])
+                points[-1].append(self.pixel[camera, line])
+                offsets[-1].append(_across(ideal[camera, line]))
+                sigmas[-1].append(self.sigma[camera, line])
+        if not pairs:
+            raise ValueError("no camera has an image line of at least 3 points")
+        index = torch.tensor(pairs, device=self.zoom.device)
+        sizes = self.image_size[index[:, 0]].cpu().numpy()
+        patterns = LinePatterns.from_lists(points, sizes, offsets, sigmas)
+        return patterns.to(self.pixel.device), index
+
     def save(self, path: str | Path) -> None:
         """Write the batch as NPZ, without pickles; a reader sees the old file or the new one."""
         arrays = {
@@ -177,6 +235,13 @@ class Observations(Batched):
             return cls.from_lists(stored.to_lists())
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+def _across(points: Tensor) -> Tensor:
+    """(n, 2) vectors from the line nearest to all of (n, 2) points to each of them."""
+    away = points - points.mean(0)
+    normal = torch.linalg.eigh(away.T @ away).eigenvectors[:, 0]
+    return (away @ normal).unsqueeze(-1) * normal
 
 
 def _checked(number: int, one: Mapping) -> dict:

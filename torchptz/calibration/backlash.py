@@ -54,6 +54,10 @@ def load_behind(motor: Tensor, play: Tensor) -> tuple[Tensor, Tensor]:
 def _clamped(
     value: Tensor, slope: Tensor, low: Tensor, high: Tensor, low_slope: Tensor, high_slope: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """A value moved between two bounds, and its slope."""
-    moved = torch.where(value < low, low_slope, torch.where(value > high, high_slope, slope))
-    return torch.minimum(torch.maximum(value, low), high), moved
+    """A value moved between two bounds, and its slope as the play grows."""
+    raised = torch.where(value < low, low_slope, slope)
+    raised = torch.where(value == low, torch.maximum(slope, low_slope), raised)
+    value = torch.maximum(value, low)
+    moved = torch.where(value > high, high_slope, raised)
+    moved = torch.where(value == high, torch.minimum(raised, high_slope), moved)
+    return torch.minimum(value, high), moved
