@@ -20,7 +20,6 @@ from torchptz.lens import RadialLens
 _MORE_POWERS = 2
 _CLEAR = 3.0  # standard deviations by which more powers must explain the points better
 _GRID = (9, 7)
-_SMALLEST_SHARE = 0.1  # of the largest standard deviation: near the centre all errors are small
 
 
 def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
@@ -35,10 +34,11 @@ def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
         known: priors.
 
     Returns:
-        (C, Z), 1 where more powers would not help. With the covariance times this, the standard
-        deviation of a point of the picture is at least as large as its move would be.
+        (C, Z), 1 where more powers would not help. With the covariance times this, the variance of
+        the picture's points is larger by the square of what they would move, in the mean over the
+        picture.
 
-    Source: score test (Rao 1948) and its one-step estimate.
+    Source: score test (Rao 1948) and its one-step estimate; Hausman 1978 for what is chance.
     """
     rich, theta, priors, places = _with_more_powers(problem, refined.theta, known)
     prediction = predict(rich, theta)
@@ -52,8 +52,6 @@ def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     step = (covariance @ torch.where(free, right, 0.0).unsqueeze(-1)).squeeze(-1)
 
     layout = rich.layout
-    zooms, head, _ = layout.split(theta)
-    zoom_step, head_step, _ = layout.split(step)
     each = torch.arange(layout.zooms, device=theta.device)[:, None] * layout.per_zoom
     extra = each + torch.tensor([at.COEFFICIENTS + place for place in places], device=theta.device)
     moved = step[:, extra]  # (C, Z, more)
@@ -64,52 +62,64 @@ def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     spread = (2 / (9 * more)) ** 0.5
     clear = (wald > more * (1 - spread**2 + _CLEAR * spread) ** 3) & ~failed[:, None]
 
-    def flat(values: Tensor) -> Tensor:
-        return values.flatten(0, 1)
-
-    center = head[:, None, at.POINT] + zooms[..., at.WANDER] + zooms[..., at.DECENTERING]
-    shift = head_step[:, None, at.POINT] + zoom_step[..., at.WANDER]
-    shift = shift + zoom_step[..., at.DECENTERING]
-    size = rich.image_size.repeat_interleave(layout.zooms, 0)
-    aspect = head[:, at.LOG_ASPECT].exp().repeat_interleave(layout.zooms, 0)
-    lens = RadialLens(
-        flat(center),
-        flat(zooms[..., at.COEFFICIENTS : layout.pupil]),
-        rich.powers,
-        None,
-        size,
-        aspect,
-    )
-    axes = [torch.arange(n, dtype=torch.float64) / (n - 1) for n in _GRID]
-    grid = torch.cartesian_prod(*axes).to(theta) * size[:, None] - 0.5
-    inside = lens.is_valid(grid)
-    jacobian = undistort_jacobian(lens, grid)  # (CZ, G, 2, 2 + K + more)
-    change = torch.cat([shift, zoom_step[..., at.COEFFICIENTS : layout.pupil]], -1)
-    distance = (jacobian @ flat(change)[:, None, :, None]).square().sum((-2, -1))
-    own = [0, 1, *(2 + k for k in range(len(rich.powers)) if k not in places)]
-    variance = _variance(problem, refined, jacobian[..., own])
-    variance = torch.where(inside, variance, 0.0)
-    floor = _SMALLEST_SHARE**2 * variance.amax(1, keepdim=True)
-    ratio = distance / torch.maximum(variance, floor).clamp_min(1e-300)
-    ratio = torch.where(inside, ratio, 0.0).amax(1).reshape(clear.shape)
+    columns, index, inside = _rays(rich, theta)
+    distance = (columns @ step[:, index].unflatten(2, (1, -1, 1))).square().sum((-2, -1))
+    known_rich = covariance * (free[:, :, None] & free[:, None])
+    own_columns, own_index, _ = _rays(problem, refined.theta)
+    variance = _variance(own_columns, own_index, refined.covariance)
+    # More powers know less, and move the picture by so much by chance alone.
+    chance = _variance(columns, index, known_rich) - variance
+    move, spread = (torch.where(inside, one, 0.0).sum(2) for one in (distance - chance, variance))
+    ratio = (move / spread.clamp_min(1e-300)).clamp_min(0)
     return torch.where(clear & ratio.isfinite(), 1 + ratio, 1.0)
 
 
-def _variance(problem: Problem, refined: Refined, jacobian: Tensor) -> Tensor:
-    """(CZ, G) px², of undistorted points, by the solution's own unknowns."""
+def _rays(problem: Problem, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How the rays of picture points depend on the unknowns of their zoom.
+
+    Where a lens is stretched and its focal length is longer by as much, no ray moves.
+
+    Returns:
+        (C, Z, G, 2, M) derivatives, px of the undistorted picture; (Z, M) the places in theta that
+        they belong to; (C, Z, G) bool, points with a ray.
+    """
     layout = problem.layout
-    each = torch.arange(layout.zooms, device=jacobian.device)[:, None] * layout.per_zoom
-    own = each + torch.arange(layout.per_zoom, device=jacobian.device)
-    point = layout.zooms * layout.per_zoom + torch.arange(2, device=jacobian.device)
-    index = torch.cat([own, point.expand(layout.zooms, 2)], 1)  # (Z, per_zoom + 2)
-    covariance = refined.covariance[:, index[:, :, None], index[:, None]].flatten(0, 1)
-    select = jacobian.new_zeros(jacobian.shape[-1], index.shape[1])
-    eye = torch.eye(2).to(jacobian)
-    select[:2, at.WANDER] = select[:2, at.DECENTERING] = select[:2, -2:] = eye
-    count = jacobian.shape[-1] - 2
-    select[2:, at.COEFFICIENTS : at.COEFFICIENTS + count] = torch.eye(count).to(jacobian)
-    lens = select @ covariance @ select.T
-    return ((jacobian @ lens[:, None]) * jacobian).sum((-2, -1))
+    zooms, head, _ = layout.split(theta)
+    point = (head[:, None, at.POINT] + zooms[..., at.WANDER]).flatten(0, 1)
+    zooms = zooms.flatten(0, 1)
+    size = problem.image_size.repeat_interleave(layout.zooms, 0)
+    lens = RadialLens(
+        point + zooms[:, at.DECENTERING],
+        zooms[:, at.COEFFICIENTS : layout.pupil],
+        problem.powers,
+        None,
+        size,
+        head[:, at.LOG_ASPECT].exp().repeat_interleave(layout.zooms, 0),
+    )
+    axes = [torch.arange(n, dtype=torch.float64) / (n - 1) for n in _GRID]
+    grid = torch.cartesian_prod(*axes).to(theta) * size[:, None] - 0.5
+    by_lens = undistort_jacobian(lens, grid)  # (CZ, G, 2, 2 + K)
+    by_center, by_coefficients = by_lens[..., :2], by_lens[..., 2:]
+    by_point = by_center - torch.eye(2).to(theta)
+    away = (lens.undistort(grid) - point[:, None]).nan_to_num(0.0).unsqueeze(-1)
+    nothing = torch.zeros_like(away)
+    columns = [-away, by_point, by_center, by_coefficients, nothing, by_point]
+    each = torch.arange(layout.zooms, device=theta.device)[:, None] * layout.per_zoom
+    own = each + torch.arange(layout.per_zoom, device=theta.device)
+    shared = layout.zooms * layout.per_zoom + torch.arange(2, device=theta.device)
+    index = torch.cat([own, shared.expand(layout.zooms, 2)], 1)
+    shape = (len(theta), layout.zooms)
+    return (
+        torch.cat(columns, -1).unflatten(0, shape),
+        index,
+        lens.is_valid(grid).unflatten(0, shape),
+    )
+
+
+def _variance(columns: Tensor, index: Tensor, covariance: Tensor) -> Tensor:
+    """(C, Z, G) px², of points with derivatives (C, Z, G, 2, M) by what ``index`` (Z, M) says."""
+    own = covariance[:, index[:, :, None], index[:, None]]  # (C, Z, M, M)
+    return ((columns.flatten(2, 3) @ own).unflatten(2, columns.shape[2:4]) * columns).sum((-2, -1))
 
 
 def _with_more_powers(
