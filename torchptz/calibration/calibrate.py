@@ -23,13 +23,14 @@ from torchptz.observations import Observations
 _VAGUE_FOCAL = 0.5  # relative, about the start, where no prior tells: keeps a lone look solvable
 _ROUGH_ROUNDS, _SETTLED_ROUGHLY = 5, 0.1  # until outliers can be told
 _SELECTIONS = 3  # times that inliers are chosen
+_FEW, _MANY = (1, 2, 3), (1, 2, 3, 4, 5)  # powers that "auto" chooses from
 _CHUNK = 2**25  # numbers in the largest tensor of a part of the batch
 
 
 def calibrate(
     observations: Observations,
     priors: Priors | None = None,
-    powers: Sequence[float] = (1, 2, 3),
+    powers: Sequence[float] | str = (1, 2, 3),
     robust: bool = True,
 ) -> Calibration:
     """Complete internal calibration of every camera of a batch from the poses of its head.
@@ -38,13 +39,14 @@ def calibrate(
     length, lens, principal point and entrance pupil, and of the rays, tilt zero, boresight, roll
     and backlash that the zooms of a camera share. Readings are noisy: what a stop's reading erred
     by is marginalised, and how much that is, is learnt. Nothing about the head is believed without
-    a sigma; what the data cannot tell stays at its prior (`undetermined`).
+    a sigma; what the data cannot tell stays at its prior (`Calibration.undetermined`).
 
     Args:
         observations: C cameras, all zooms and features together: the long end pins the head, and
             the head pins the wide end.
         priors: default `Priors()`.
-        powers: K positive, increasing powers of r in L.
+        powers: K positive, increasing powers of r in L; or "auto", which gives the zooms that 1, 2
+            and 3 cannot follow two more. Coefficients that a zoom does not need are 0.
         robust: set outlying observations aside.
 
     Returns:
@@ -57,21 +59,45 @@ def calibrate(
     Source: README, "Beyond the paper".
     """
     priors = priors or Priors()
-    exponents = checked_powers(powers)
-    problem = Problem.from_observations(observations, exponents)
+    if not isinstance(powers, str):
+        return _in_parts(observations, priors, checked_powers(powers), robust)
+    if powers != "auto":
+        raise ValueError(f'powers are numbers, or "auto", not {powers!r}')
+    first = _in_parts(observations, priors, checked_powers(_FEW), robust)
+    return _in_parts(observations, priors, checked_powers(_MANY), robust, first.growth > 1)
+
+
+def _in_parts(
+    observations: Observations,
+    priors: Priors,
+    powers: Tensor,
+    robust: bool,
+    richer: Tensor | None = None,
+) -> Calibration:
+    """Calibrate as many cameras at a time as the memory is good for.
+
+    richer: (C, Z) bool, zooms that have all powers and not only the first few; None: all have.
+    """
+    problem = Problem.from_observations(observations, powers)
     known = known_of(priors, observations, problem.layout, problem.used)
+    if richer is not None:
+        known = known.with_coefficients_held(problem.layout, len(_FEW), ~richer)
     noise = _assumed_noise(priors, observations)
     size = 2 * problem.pixel.shape[1] * problem.layout.size
     step = max(1, _CHUNK // max(1, size))
     parts = [slice(begun, begun + step) for begun in range(0, len(observations), step)]
     learn = not priors.reading_known
     with torch.no_grad():
-        return Calibration.cat(
+        found = Calibration.cat(
             [
                 _calibrated(observations[p], problem[p], known[p], noise[p], learn, robust)
                 for p in parts
             ]
         )
+    if richer is None:
+        return found
+    # Whether the first few are enough was seen before.
+    return replace(found, growth=torch.where(richer, found.growth, 1.0))
 
 
 def _calibrated(
@@ -107,9 +133,7 @@ def _calibrated(
 
 def _assumed_noise(priors: Priors, o: Observations) -> Noise:
     """A head that stops anywhere and reports the nearest multiple of its quantum."""
-    repeatability = torch.as_tensor(priors.repeatability).to(o.quantum)
-    if repeatability.ndim == 1 and len(repeatability) == len(o):
-        repeatability = repeatability[:, None]
+    repeatability = torch.as_tensor(priors.repeatability).to(o.quantum).reshape(-1, 1)
     head = (o.quantum**2 / 12 + repeatability**2).clamp_min(_FINEST_READING**2)
     return Noise(head.expand(len(o), 2), torch.ones_like(head[:, 0]))
 

@@ -112,6 +112,14 @@ class Known(Batched):
         """(C, T), 0 for what is held: it has no say."""
         return torch.where(self.free, self.sigma, torch.inf) ** -2
 
+    def with_coefficients_held(self, layout: Layout, first: int, zooms: Tensor) -> Known:
+        """The same with the coefficients but the ``first`` held at ``zooms`` (C, Z) bool."""
+        levels, head, features = layout.split(self.sigma)
+        levels = levels.clone()
+        more = levels[..., at.COEFFICIENTS + first : layout.pupil]
+        more.masked_fill_(zooms.unsqueeze(-1), 0.0)
+        return Known(self.mean, layout.join(levels, head, features))
+
     def value(self, theta: Tensor) -> Tensor:
         """(C,) sum of squared standardised distances."""
         return (self.information * (theta - self.mean) ** 2).sum(1)
@@ -133,7 +141,7 @@ def known_of(priors: Priors, observations: Observations, layout: Layout, used: T
     def tensor(value: object, name: str, *tail: int) -> Tensor:
         """(C, *tail) of a number, (C,) or (C, *tail)."""
         value = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-        if value.ndim == 1 and value.shape != tail[:1]:
+        if value.ndim == 1 and name != "principal_point":  # of the cameras
             value = value.reshape(-1, *[1] * len(tail))
         try:
             return value.expand(cameras, *tail)
