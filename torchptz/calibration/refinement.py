@@ -182,7 +182,7 @@ def _advance(
         kink = active & ~play_held & (damping > _DAMPING_AT_KINK)
         play_held = play_held | kink
         damping = torch.where(kink, _DAMPING_START, damping)
-        quiet = change < _SETTLED_NOISE
+        quiet = change < max(_SETTLED_NOISE, settled)
         converged = torch.where(active, (promised < _CONVERGED) & quiet, converged)
         active = active & ~((promised < settled) & quiet) & (damping < _DAMPING_HIGHEST)
     return _Progress(theta, noise, weight, damping, iterations, converged, active, play_held)

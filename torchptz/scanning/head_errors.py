@@ -53,7 +53,7 @@ def displacements(
     Returns:
         (N, 2, 4) undistorted px per standard deviation of each of `HeadErrors.by_source`.
 
-    Source: README, "What a small residual does not say".
+    Source: README, "The head in the equation".
     """
     turn = head_rotation(pan, tilt)
     at_reading = head_rotation(*pan_tilt_from_ray(ray))
