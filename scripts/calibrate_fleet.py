@@ -3,7 +3,9 @@
 
 import argparse
 import sys
+from pathlib import Path
 
+from torchptz.cli.printing import print_summary
 from torchptz.fleet.calibrate import calibrate
 from torchptz.fleet.config import ConfigError
 from torchptz.fleet.progress import Stages
@@ -12,7 +14,7 @@ from torchptz.fleet.progress import Stages
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", help="the fleet, such as configs/fleet.yaml")
-    parser.add_argument("out", help="folder of the run, such as runs/demo")
+    parser.add_argument("out", type=Path, help="folder of the run, such as runs/demo")
     parser.add_argument("--powers", type=float, nargs="+", default=[1, 2, 3], help="of r in L")
     options = parser.parse_args()
 
@@ -22,11 +24,7 @@ def main() -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    for name, camera in summary.cameras.items():
-        for zoom in camera.zooms:
-            rms = "" if zoom.rms_px is None else f"{zoom.rms_px:.3f} px"
-            print(f"{name} at {zoom.magnification:.2f}x: {rms} {zoom.error or 'ok'}")
-        print(f"{name}: {camera.error or camera.table or 'no lens'}")
+    print_summary(summary, options.out)
     return 0 if summary.all_ok else 2 if summary.none_ok else 1
 
 

@@ -46,6 +46,7 @@ class FakeCamera:
     pose: Pose = field(default_factory=lambda: Pose(0.0, 0.0, 0.0))
     # (3, 3) rotation of the camera in the head's moving frame
     mount: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
+    tilt_zero: float = 0.0  # rad, true tilt less the reading
 
     def move(self, pose: Pose) -> None:
         self.pose = Pose(*self.capabilities.nearest_reachable(pose.pan, pose.tilt), pose.zoom)
@@ -73,7 +74,7 @@ class FakeCamera:
 
     def ball(self, pose: Pose) -> np.ndarray:
         """(2,) px of the ball, NaN where the lens or the head cannot see it."""
-        angles = torch.tensor([pose.pan, pose.tilt], dtype=torch.float64)
+        angles = torch.tensor([pose.pan, pose.tilt + self.tilt_zero], dtype=torch.float64)
         image = project(self.mount @ to_camera(self.ray, *angles)).numpy()
         focal = self.focal_length * self.magnification(pose.zoom)
         focal = focal * np.array([1.0, float(self.lens.pixel_aspect[0])])
@@ -86,7 +87,8 @@ class FakeObserver:
     """Looks without pictures: finds the ball wherever it is whole and inside the search circle.
 
     ``blind`` says which looks, counted from 0, find nothing; ``slip`` is added to the pose of the
-    head (pan, tilt, rad) in what it shows and reads.
+    head (pan, tilt, rad) in what it shows and reads; ``noise`` (px, one sigma) to what it sees.
+    Every look is handed to ``record``.
     """
 
     camera: FakeCamera
@@ -94,10 +96,21 @@ class FakeObserver:
     blind: Callable[[int], bool] = lambda number: False
     slip: Callable[[int], tuple[float, float]] = lambda number: (0.0, 0.0)
     looks: list[Observation] = field(default_factory=list)
+    noise: float = 0.0
+    record: Callable[[Observation], None] = lambda look: None
     searches: list[tuple[np.ndarray, float]] = field(default_factory=list)
+    _random: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
 
     def look(
-        self, pose, purpose, *, zoom_index=-1, group=0, near, search_radius, expected_radius
+        self,
+        pose,
+        purpose,
+        *,
+        zoom_index=-1,
+        group=0,
+        near=None,
+        search_radius=math.inf,
+        expected_radius=None,
     ) -> Observation:
         number = len(self.looks)
         self.camera.move(pose)
@@ -107,8 +120,9 @@ class FakeObserver:
         seen = self.camera.ball(at)
         size = self.camera.lens.image_size[0].numpy()
         whole = ((seen > self.radius - 0.5) & (seen < size - 0.5 - self.radius)).all()
-        near = near(at) if callable(near) else near
+        near = near(at) if callable(near) else seen if near is None else near
         near_enough = np.linalg.norm(seen - near) <= search_radius
+        seen = seen + self.noise * self._random.standard_normal(2)
         found = bool(whole and near_enough and not self.blind(number))
         self.searches.append((np.asarray(near), search_radius))
         self.looks.append(
@@ -121,11 +135,12 @@ class FakeObserver:
                 read_after=at,
                 pixel=tuple(seen.tolist()) if found else None,
                 sigma=0.05 if found else None,
-                radius=expected_radius if found else None,
+                radius=(expected_radius or self.radius) if found else None,
                 quality=1.0 if found else None,
                 reason=None if found else "not there",
                 rest_rule="in memory",
                 taken_at=0.0,
             )
         )
+        self.record(self.looks[-1])
         return self.looks[-1]

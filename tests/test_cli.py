@@ -17,10 +17,12 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from tests import synthetic
-from torchptz.cli import _summary_table, main
+from torchptz.cli import main
+from torchptz.cli.printing import summary_table
 from torchptz.estimation import estimate
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
-from torchptz.fleet.solve import CameraResult, Summary, ZoomResult, solve
+from torchptz.fleet.solve import solve
+from torchptz.fleet.summary import CameraResult, HeadResult, Summary, ZoomResult
 from torchptz.rectification import rectify
 from torchptz.zoom_table import ZoomTable
 
@@ -132,7 +134,7 @@ class TestSmallRun:
             told.update(options, powers=powers)
             return estimate(patterns, **options)
 
-        monkeypatch.setattr("torchptz.fleet.solve.estimate", watching)
+        monkeypatch.setattr("torchptz.fleet.line_solution.estimate", watching)
         assert run("solve", tmp_path / "run").exit_code == 0
         assert (told["powers"], told["method"], told["robust"]) == ((1.0, 2.0, 3.0), "ml", True)
         assert run("solve", tmp_path / "run", "--method", "lanz", "--no-robust").exit_code == 0
@@ -145,6 +147,13 @@ class TestSmallRun:
         assert run("solve", tmp_path / "run", "--without-offsets").exit_code == 0
         folder = tmp_path / "run" / "harp"
         assert (folder / "table_without_offsets.json").exists()
+        assert not (folder / "table.json").exists()
+
+    def test_lines_only_goes_to_another_table(self, line_set, tmp_path):
+        run("collect", line_set, "--out", tmp_path / "run")
+        assert run("solve", tmp_path / "run", "--lines-only").exit_code == 0
+        folder = tmp_path / "run" / "harp"
+        assert (folder / "table_lines_only.json").exists()
         assert not (folder / "table.json").exists()
 
 
@@ -214,7 +223,7 @@ class TestSummaryTable:
             "dead": CameraResult((), None, "switched off"),
         }
         text = io.StringIO()
-        Console(file=text, width=80).print(_summary_table(Summary(cameras), "Lenses"))
+        Console(file=text, width=80).print(summary_table(Summary(cameras), "Lenses"))
         rows = [line.rstrip() for line in text.getvalue().splitlines() if "0.123" in line]
         assert len(rows) == 6
         for row in rows:
@@ -228,7 +237,7 @@ class TestSummaryTable:
         zoom = ZoomResult(None, 1.0, None, True, "OK", rms_px=0.1, gain=1.0, gain_sigma=None)
         text = io.StringIO()
         summary = Summary({"a": CameraResult((zoom,), "t", None)})
-        Console(file=text, width=80).print(_summary_table(summary, "Lenses"))
+        Console(file=text, width=80).print(summary_table(summary, "Lenses"))
         assert "1.000" in text.getvalue()
         assert "±" not in text.getvalue()
 
@@ -236,9 +245,69 @@ class TestSummaryTable:
         zoom = ZoomResult(None, 1.0, None, True, "OK", rms_px=0.1, sigma_px=0.25)
         text = io.StringIO()
         summary = Summary({"a": CameraResult((zoom,), "t", None)})
-        Console(file=text, width=80).print(_summary_table(summary, "Lenses"))
+        Console(file=text, width=80).print(summary_table(summary, "Lenses"))
         (row,) = (line for line in text.getvalue().splitlines() if "0.100" in line)
         assert row.split() == ["a", "1", "ok", "0.100", "0.25"]
+
+
+class TestHeads:
+    """What is printed of cameras whose heads were calibrated."""
+
+    head = HeadResult(
+        tilt_zero_deg=0.4013,
+        tilt_zero_sigma_deg=0.0098,
+        boresight_deg=-0.2958,
+        boresight_sigma_deg=0.0138,
+        roll_deg=0.8004,
+        roll_sigma_deg=0.0012,
+        backlash_deg=(0.0, 0.05),
+        backlash_sigma_deg=(0.001, 0.002),
+        reading_sigma_deg=(0.02, 0.0123),
+        reading_sigma_quanta=(0.288, None),
+    )
+
+    @pytest.fixture
+    def summary(self):
+        zooms = tuple(
+            ZoomResult(
+                *(nominal, nominal, 1000 * nominal, True, "OK"),
+                **{"rms_px": 0.1234, "sigma_px": 0.52, "center": (368.46, 270.61)},
+                **{"focal_length_px": 738.04 * nominal, "focal_length_sigma_px": 3.04},
+            )
+            for nominal in (1.0, 25.0)
+        )
+        told = ("entrance pupil at 1x: take a feature farther away",)
+        moved = CameraResult(zooms, "t", None, self.head, told)
+        return Summary({"entrance": moved, "dead": CameraResult((), None, "switched off")})
+
+    def test_a_table_with_focal_lengths(self, summary):
+        text = io.StringIO()
+        Console(file=text, width=80).print(summary_table(summary, "Lenses"))
+        rows = [line.split() for line in text.getvalue().splitlines() if "0.123" in line]
+        assert [row[-2] for row in rows] == ["738.0±3.0", "18451.0±3.0"]
+        assert "gain" not in text.getvalue()
+        assert "by all that was estimated" in text.getvalue()
+
+    def test_a_line_for_the_head_and_for_each_thing_that_is_open(
+        self, summary, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr("torchptz.fleet.solve.solve", lambda *_, **__: summary)
+        result = run("solve", tmp_path)
+        assert result.exit_code == 1
+        (head,) = (line for line in result.stdout.splitlines() if "boresight" in line)
+        assert head == (
+            "entrance: tilt zero 0.401±0.010°, boresight -0.296±0.014°, roll 0.800±0.001°, "
+            "backlash 0.000±0.001° and 0.050±0.002°, readings good to 0.29 quanta and 0.0123°"
+        )
+        (told,) = (line for line in result.stdout.splitlines() if "pupil" in line)
+        assert told.startswith("entrance: not determined: entrance pupil at 1x: take a feature")
+        assert result.stderr == "dead: switched off\n"
+
+    def test_what_only_lines_have_is_refused_before_anything_is_collected(self, config, tmp_path):
+        path = config({"name": "gate", "address": "127.0.0.1:1"}, dialect="sony_rz30", zooms=[1])
+        text = failed("calibrate", path, "--out", tmp_path / "run", "--method", "lanz")
+        assert "add --lines-only" in text
+        assert not (tmp_path / "run").exists()
 
 
 class TestPartlyFailed:

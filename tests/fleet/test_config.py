@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from torchptz.calibration import Priors
 from torchptz.fleet.config import ConfigError, FleetConfig, load_config, parse_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -34,7 +35,7 @@ class TestDefaults:
         assert (scan.horizontal, scan.vertical, scan.oblique) == (12, 10, 0)
         assert (scan.points_per_line, scan.tracks) == (20, 8)
         assert (one.pixel_aspect, one.pan_sign, one.tilt_sign) == (1.0, 1, 1)
-        assert (one.tilt_zero_sigma_deg, one.boresight_sigma_deg) == (0.1, 0.1)
+        assert (scan.design, scan.target_sigma_px) == ("spread", 0.2)
         assert one.feature.kind == "ball"
         assert one.feature.direction() is None
         assert one.resolve_credentials() is None
@@ -75,6 +76,44 @@ class TestDefaults:
         assert text.startswith("fleet.yaml: defaults.scan.horizontl: ")
 
 
+class TestHead:
+    def test_the_defaults_are_those_of_the_calibration(self):
+        head, priors = parse_config({"cameras": [camera()]}).cameras[0].head, Priors()
+        for name in ("tilt_zero_sigma", "boresight_sigma", "roll_sigma", "backlash_sigma"):
+            assert math.radians(getattr(head, f"{name}_deg")) == pytest.approx(
+                getattr(priors, name)
+            )
+        assert (head.pupil_m, head.pupil_sigma_m) == (priors.pupil_m, priors.pupil_sigma_m)
+        assert math.radians(head.repeatability_deg) == priors.repeatability
+
+    def test_defaults_and_a_camera_share_the_section(self):
+        config = parse_config(
+            {
+                "defaults": {"head": {"tilt_zero_sigma_deg": 0.3, "pupil_m": 0.02}},
+                "cameras": [camera(head={"pupil_m": 0.04})],
+            }
+        )
+        (one,) = config.cameras
+        assert (one.head.tilt_zero_sigma_deg, one.head.pupil_m) == (0.3, 0.04)
+
+    def test_two_of_its_settings_may_stand_beside_it(self, tmp_path):
+        config = parse_config(
+            {
+                "defaults": {"tilt_zero_sigma_deg": 0.2},
+                "cameras": [camera(boresight_sigma_deg=0.4, head={"roll_sigma_deg": 1})],
+            }
+        )
+        head = config.cameras[0].head
+        assert (head.tilt_zero_sigma_deg, head.boresight_sigma_deg) == (0.2, 0.4)
+        assert head.roll_sigma_deg == 1.0
+        config.save(tmp_path / "copy.yaml")
+        assert load_config(tmp_path / "copy.yaml") == config
+
+    def test_but_not_twice(self):
+        text = refused(camera(boresight_sigma_deg=0.4, head={"boresight_sigma_deg": 0.4}))
+        assert "given twice; give head.boresight_sigma_deg alone" in text
+
+
 class TestDirectionsAndOptions:
     def test_degrees_become_radians(self):
         one = parse_config({"cameras": [camera(feature={"pan_deg": 90, "tilt_deg": -45})]})
@@ -99,6 +138,14 @@ class TestMessages:
             ({"feature": {"pan_deg": 1, "tilt_deg": 95}}, [".feature.tilt_deg", "95", "<= 90"]),
             ({"feature": {"kind": "cube"}}, ["feature.kind", "'ball'", "'cube'"]),
             ({"feature": {"distance_m": 0}}, ["feature.distance_m", "greater than 0"]),
+            ({"feature": {"distance_sigma_m": 1}}, ["distance_sigma_m goes with a distance_m"]),
+            ({"head": {"rol_sigma_deg": 1}}, ["head.rol_sigma_deg", "mean roll_sigma_deg?"]),
+            ({"head": {"pupil_sigma_m": -1}}, ["head.pupil_sigma_m", ">= 0", "-1"]),
+            ({"tilt_zero_sigma_deg": 11}, ["head.tilt_zero_sigma_deg", "<= 10", "11"]),
+            ({"head": 3}, ["head", "mapping", "roll_sigma_deg"]),
+            ({"scan": {"design": "best"}}, ["scan.design", "'spread' or 'optimal'", "'best'"]),
+            ({"scan": {"target_sigma_px": 0}}, ["scan.target_sigma_px", "greater than 0"]),
+            ({"scan": {"most_views": 5}}, ["scan.most_views", ">= 20"]),
             ({"zooms": [2, 1]}, ["zooms", "ascending"]),
             ({"zooms": [1, 1]}, ["zooms", "ascending"]),
             ({"zooms": [0.5, 1]}, ["zooms[0]", "greater than or equal to 1", "0.5"]),
@@ -260,4 +307,7 @@ class TestShippedConfigurations:
             ball = truth["scene"]["ball"]
             assert one.feature.pan_deg == ball["pan_deg"]
             assert one.feature.tilt_deg == ball["tilt_deg"]
+            off = abs(one.feature.distance_m - ball["distance_m"])
+            assert off < 3 * one.feature.distance_sigma_m
+            assert one.pixel_aspect == truth["head"].get("pixel_aspect", 1.0)
             assert one.credentials.user == truth.get("user", "admin")

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from torchptz.fleet.config import FeatureConfig, HeadConfig
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.patterns import LinePatterns
 
@@ -19,7 +20,11 @@ def record() -> CameraRecord:
         ray=[0.0, 0.6, 0.8],
         ray_sigma=1e-4,
         head_errors={"ray left": 1e-4, "boresight left": 2e-3},
-        feature={"kind": "ball"},
+        quantum_deg=[0.07, 0.064],
+        horizontal_fov_deg=45.0,
+        max_magnification=25.0,
+        feature=FeatureConfig(distance_m=12.0, distance_sigma_m=0.5),
+        head=HeadConfig(tilt_zero_sigma_deg=0.2, pupil_m=0.03),
         zooms=[
             ZoomRecord(nominal_zoom=2.0, zoom_units=5638.0, magnification=2.1, lines=3, points=60)
         ],
@@ -39,6 +44,19 @@ class TestFile:
         path.write_text(json.dumps(stored))
         assert CameraRecord.load(tmp_path) == record().model_copy(update={"head_errors": {}})
 
+    def test_one_from_before_heads_were_calibrated_is_read(self, tmp_path):
+        record().save(tmp_path)
+        path = tmp_path / "camera.json"
+        stored = json.loads(path.read_text())
+        for name in ("quantum_deg", "horizontal_fov_deg", "max_magnification", "head"):
+            del stored[name]
+        del stored["feature"]["distance_sigma_m"]
+        path.write_text(json.dumps(stored))
+        old = CameraRecord.load(tmp_path)
+        assert (old.quantum_deg, old.horizontal_fov_deg, old.max_magnification) == (None,) * 3
+        assert old.head == HeadConfig()
+        assert (old.feature.distance_m, old.feature.distance_sigma_m) == (12.0, None)
+
     def test_it_names_its_schema(self, tmp_path):
         record().save(tmp_path)
         stored = json.loads((tmp_path / "camera.json").read_text())
@@ -52,6 +70,8 @@ class TestFile:
             ({"name": None}, "name"),
             ({"surprise": 1}, "surprise"),
             ({"zooms": [{"magnification": "x"}]}, "zooms.0.magnification"),
+            ({"head": {"roll_sigma_deg": -1}}, "head.roll_sigma_deg"),
+            ({"feature": {"kind": "cube"}}, "feature.kind"),
         ],
     )
     def test_another_file_is_refused_by_name_and_field(self, tmp_path, change, word):

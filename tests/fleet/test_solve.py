@@ -8,7 +8,7 @@ import torch
 
 from tests import synthetic
 from torchptz.estimation import Status, estimate
-from torchptz.fleet import solve as module
+from torchptz.fleet import line_solution as module
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.fleet.solve import solve
 from torchptz.patterns import LinePatterns

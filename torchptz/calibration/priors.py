@@ -54,8 +54,8 @@ class Priors:
         reading_known: whether that noise is known, or to be learnt from the residuals.
 
     Raises:
-        ValueError: a sigma that is negative or not a number, a distance, focal length or aspect
-            that is not positive.
+        ValueError: a sigma that is negative or not a number, another value that is not finite, a
+            distance, focal length or aspect that is not positive; names the value.
     """
 
     focal_length: Tensor | float | None = None
@@ -85,14 +85,20 @@ class Priors:
             if value is None or name == "reading_known":
                 continue
             tensor = torch.as_tensor(value, dtype=torch.float64)
-            if name.endswith("sigma") or name in ("pupil_sigma_m", "distance_sigma_m"):
+            text = f"{name} must be {{}}, not {tensor.tolist()}"
+            if "sigma" in name:
                 if not bool((tensor >= 0).all()):
-                    raise ValueError(f"{name} must be 0 or more, not {tensor.tolist()}")
-            elif name in ("focal_length", "distance_m", "pixel_aspect"):
-                # A NaN stands for a value that one camera, zoom or feature lacks.
-                there = tensor[~tensor.isnan()] if name != "pixel_aspect" else tensor
-                if not bool((there > 0).all()):
-                    raise ValueError(f"{name} must be positive, not {tensor.tolist()}")
+                    raise ValueError(text.format("0 or more"))
+                continue
+            if name in ("focal_length", "distance_m"):
+                # A NaN stands for what one camera, zoom or feature lacks.
+                tensor = tensor[~tensor.isnan()]
+            if not bool(tensor.isfinite().all()):
+                raise ValueError(text.format("finite"))
+            if name in ("focal_length", "distance_m", "pixel_aspect") and bool((tensor <= 0).any()):
+                raise ValueError(text.format("positive"))
+            if name == "repeatability" and bool((tensor < 0).any()):
+                raise ValueError(text.format("0 or more"))
 
 
 @dataclass(frozen=True, eq=False)

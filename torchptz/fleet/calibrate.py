@@ -9,7 +9,8 @@ from torchptz.fleet.collector import Progress
 from torchptz.fleet.config import FleetConfig, load_config
 from torchptz.fleet.driver import collect
 from torchptz.fleet.records import CameraRecord
-from torchptz.fleet.solve import Summary, solve
+from torchptz.fleet.solve import check_method, solve
+from torchptz.fleet.summary import Summary
 
 CONFIG_NAME = "config.yaml"
 
@@ -50,7 +51,8 @@ def calibrate(
     """
     if not isinstance(config, FleetConfig):
         config = load_config(config)
+    names = [camera.name for camera in config.cameras]
+    check_method(names, **estimation)  # before hours are spent
     collect_fleet(config, out, progress)
     # The run's folder may still hold cameras of an earlier configuration.
-    names = [camera.name for camera in config.cameras]
     return solve(out, powers, cameras=names, **estimation)

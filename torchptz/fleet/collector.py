@@ -76,7 +76,12 @@ class Collector:
             zoom level; what was collected before it is kept.
         """
         config = self._config
-        record = CameraRecord(name=config.name, pixel_aspect=config.pixel_aspect)
+        record = CameraRecord(
+            name=config.name,
+            pixel_aspect=config.pixel_aspect,
+            feature=config.feature,
+            head=config.head,
+        )
         journal: Journal | None = None
         camera: Camera | None = None
         start: Pose | None = None
@@ -122,6 +127,11 @@ class Collector:
         frame = camera.snapshot()
         self._image_size = (frame.shape[1], frame.shape[0])
         record.image_size = self._image_size
+        can = camera.capabilities
+        record.quantum_deg = [math.degrees(can.pan_quantum), math.degrees(can.tilt_quantum)]
+        record.max_magnification = can.max_magnification
+        if can.horizontal_fov is not None:
+            record.horizontal_fov_deg = math.degrees(can.horizontal_fov)
 
         zooms = [camera.zoom_units(magnification) for magnification in config.zooms]
         self._tell("finding the feature", 0, 1)
@@ -168,11 +178,10 @@ class Collector:
         record.ray, record.ray_sigma = ray.ray.tolist(), ray.ray_sigma
         head_errors = HeadErrors(
             ray.ray_sigma,
-            math.radians(config.tilt_zero_sigma_deg),
-            math.radians(config.boresight_sigma_deg),
+            math.radians(config.head.tilt_zero_sigma_deg),
+            math.radians(config.head.boresight_sigma_deg),
         )
         record.head_errors = head_errors.by_source()
-        record.feature = config.feature.model_dump()
         record.save(self._folder)
 
         for index, zoom in enumerate(zooms):

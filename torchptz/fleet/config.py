@@ -17,6 +17,7 @@ from torchptz.files import write_whole
 from torchptz.fleet.config_sections import (
     CredentialsConfig,
     FeatureConfig,
+    HeadConfig,
     ScanConfig,
     Section,
     TimingConfig,
@@ -38,6 +39,7 @@ __all__ = [
     "CredentialsConfig",
     "FeatureConfig",
     "FleetConfig",
+    "HeadConfig",
     "ScanConfig",
     "TimingConfig",
     "check_name",
@@ -47,6 +49,7 @@ __all__ = [
 
 _NAME = re.compile(r"\w[\w.-]{0,63}")
 _ONE_CAMERA_ONLY = ("name", "address")
+_OF_THE_HEAD = ("tilt_zero_sigma_deg", "boresight_sigma_deg")
 # One source of the password replaces the other, where a camera overrides the defaults.
 _ALTERNATIVES = (frozenset({"password_env", "password_file"}),)
 
@@ -79,14 +82,25 @@ class CameraConfig(Section):
     pixel_aspect: float = Field(1.0, gt=0.5, lt=2, description="width over height of a pixel")
     pan_sign: Literal[1, -1] = Field(1, description="-1: the pan axis runs the other way")
     tilt_sign: Literal[1, -1] = Field(1, description="-1: the tilt axis runs the other way")
-    tilt_zero_sigma_deg: float = Field(
-        0.1, ge=0, le=10, description="how well the tilt's zero is known, degrees, one sigma"
-    )
-    boresight_sigma_deg: float = Field(
-        0.1, ge=0, le=10, description="how well the optical axis is, degrees, one sigma per axis"
-    )
+    head: HeadConfig = HeadConfig()
     scan: ScanConfig = ScanConfig()
     timing: TimingConfig = TimingConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _head_in_one_place(cls, data: object) -> object:
+        """Two of the head's settings may stand beside its section, as they once had to."""
+        if not isinstance(data, dict):
+            return data
+        outside = {key: data[key] for key in _OF_THE_HEAD if key in data}
+        head = data.get("head", {})
+        if not outside or not isinstance(head, dict):
+            return data
+        for key in outside:
+            if key in head:
+                raise ValueError(f"{key} is given twice; give head.{key} alone")
+        rest = {key: value for key, value in data.items() if key not in outside}
+        return {**rest, "head": {**head, **outside}}
 
     @field_validator("name")
     @classmethod

@@ -1,4 +1,4 @@
-"""The sections of a camera's configuration: account, feature, scan, timing."""
+"""The sections of a camera's configuration: account, feature, head, scan, timing."""
 
 from __future__ import annotations
 
@@ -89,13 +89,24 @@ class FeatureConfig(Section):
     tilt_deg: float | None = Field(
         None, ge=-90, le=90, description="roughly where it is, degrees, > 0 down"
     )
-    distance_m: float | None = Field(None, gt=0, description="m; null: far away, or not known")
+    distance_m: float | None = Field(
+        None, gt=0, description="m, from the head's axes; null: far away, or not known"
+    )
+    distance_sigma_m: float | None = Field(
+        None, gt=0, description="how well that is known, m, one sigma; null: 5 % of it"
+    )
 
     def direction(self) -> tuple[float, float] | None:
         """(pan, tilt) rad, or None where the feature is searched from the current view."""
         if self.pan_deg is None or self.tilt_deg is None:
             return None
         return math.radians(self.pan_deg), math.radians(self.tilt_deg)
+
+    @model_validator(mode="after")
+    def _sigma_of_something(self) -> FeatureConfig:
+        if self.distance_sigma_m is not None and self.distance_m is None:
+            raise ValueError("distance_sigma_m goes with a distance_m, which is missing")
+        return self
 
     @model_validator(mode="after")
     def _both_or_neither(self) -> FeatureConfig:
@@ -108,6 +119,39 @@ class FeatureConfig(Section):
         return self
 
 
+class HeadConfig(Section):
+    """What is known of a head before it is calibrated; the defaults are those of `Priors`."""
+
+    tilt_zero_sigma_deg: float = Field(
+        1.0, ge=0, le=10, description="how well the tilt's zero is known, degrees, one sigma"
+    )
+    boresight_sigma_deg: float = Field(
+        1.0,
+        ge=0,
+        le=10,
+        description="how well the optical axis on the head is known, degrees, one sigma per axis",
+    )
+    roll_sigma_deg: float = Field(
+        2.0, ge=0, le=10, description="how well the sensor's roll is known, degrees, one sigma"
+    )
+    backlash_sigma_deg: float = Field(
+        0.1, ge=0, le=10, description="how much play its axes may have, degrees, one sigma"
+    )
+    pupil_m: float = Field(
+        0.0, ge=-1, le=1, description="m, how far the entrance pupil lies ahead of the axes"
+    )
+    pupil_sigma_m: float = Field(
+        0.05, ge=0, le=1, description="how well that is known, m, one sigma"
+    )
+    repeatability_deg: float = Field(
+        0.0,
+        ge=0,
+        le=10,
+        description="how well it stops where it reads, degrees, one sigma beside its quantum: "
+        "where the search for the readings' noise begins",
+    )
+
+
 class ScanConfig(Section):
     """Which lines are scanned at each zoom, and how densely."""
 
@@ -118,6 +162,14 @@ class ScanConfig(Section):
     tracks: int = Field(
         8, ge=2, le=100, description="places in the picture that the lens zooms at, for its axis"
     )
+    design: Literal["spread", "optimal"] = Field(
+        "spread",
+        description="spread: lines over the whole picture; optimal: views that tell most",
+    )
+    target_sigma_px: float = Field(
+        0.2, gt=0, le=100, description="optimal: enough, px, one sigma of the worst point"
+    )
+    most_views: int = Field(400, ge=20, le=20000, description="optimal: most views at each zoom")
 
     @model_validator(mode="after")
     def _enough_lines(self) -> ScanConfig:

@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from torchptz.files import write_whole
+from torchptz.fleet.config_sections import FeatureConfig, HeadConfig
 from torchptz.patterns import LinePatterns
 
 SCHEMA = "torchptz.camera_record"
@@ -66,7 +67,11 @@ class CameraRecord(_Record):
     # rad, one sigma of each error of the head's geometry, in the order in which the patterns'
     # ``systematic`` has them
     head_errors: dict[str, Annotated[float, Field(ge=0)]] = {}
-    feature: dict | None = None
+    quantum_deg: Pair | None = None  # smallest steps of pan and tilt, 0: continuous; None: unknown
+    horizontal_fov_deg: float | None = Field(None, gt=0, lt=180)  # widest zoom, by the data sheet
+    max_magnification: float | None = Field(None, gt=0)  # nominal, of the longest zoom
+    feature: FeatureConfig | None = None
+    head: HeadConfig = HeadConfig()
     zooms: list[ZoomRecord] = []
     error: str | None = None  # why the camera failed
     finished: bool = False  # False while collection runs, and where it was interrupted

@@ -22,16 +22,35 @@ class ZoomResult:
     ok: bool  # it has a lens, and collecting its lines went well
     status: str | None  # name of the fit's status; None where there was nothing to fit
     rms_px: float | None = None  # px in the picture, per degree of freedom
-    # px, the largest standard deviation of an undistorted point of the picture: by the noise of
-    # the points, and by errors of the head's geometry, that no residual shows
+    # px, the largest standard deviation of an undistorted point of the picture: by all that was
+    # estimated, the head too where its poses were, and by errors of a head that was believed, which
+    # no residual shows
     sigma_px: float | None = None
     systematic_px: float | None = None
     gain: float | None = None  # of the offsets
     gain_sigma: float | None = None
-    center: tuple[float, float] | None = None  # px
+    center: tuple[float, float] | None = None  # px, of the distortion
+    focal_length_px: float | None = None  # px along x
+    focal_length_sigma_px: float | None = None
     lines: int = 0
     points: int = 0
     error: str | None = None  # why it is not ok, or what to know about it
+
+
+@dataclass(frozen=True)
+class HeadResult:
+    """What a camera's head is like, each value with its standard deviation."""
+
+    tilt_zero_deg: float  # true tilt less the reading, the optical axis' turn with it
+    tilt_zero_sigma_deg: float
+    boresight_deg: float  # optical axis to the left in the moving frame
+    boresight_sigma_deg: float
+    roll_deg: float  # the picture's content turned clockwise
+    roll_sigma_deg: float
+    backlash_deg: tuple[float, float]  # full width of the play of pan and tilt
+    backlash_sigma_deg: tuple[float, float]
+    reading_sigma_deg: tuple[float, float]  # noise of what pan and tilt read, as found
+    reading_sigma_quanta: tuple[float | None, float | None]  # None: a continuous axis
 
 
 @dataclass(frozen=True)
@@ -41,6 +60,8 @@ class CameraResult:
     zooms: tuple[ZoomResult, ...]
     table: str | None  # file, relative to the run; None where no zoom has a lens
     error: str | None  # why the camera as a whole is not ok
+    head: HeadResult | None = None  # None where its poses did not enter
+    undetermined: tuple[str, ...] = ()  # what the observations could not tell, and what could
 
     @property
     def ok(self) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -187,7 +186,7 @@ def scan_pattern(
                 expected_radius=view.radius,
             )
             # A head that stopped beside its target shows the feature where its reading says.
-            ideal = _ideal(view, ray, _mean_pan(seen), _mean_tilt(seen))
+            ideal = _ideal(view, ray, *seen.reading)
             if seen.found:
                 misses = 0
                 predictor.learn(ideal, np.asarray(seen.pixel))
@@ -206,8 +205,8 @@ def scan_pattern(
 
 
 def _scanned(found: list[Observation], plane: Tensor, ray: Tensor, view: View) -> ScannedLine:
-    pan = torch.tensor([_mean_pan(one) for one in found], dtype=torch.float64)
-    tilt = torch.tensor([_mean_tilt(one) for one in found], dtype=torch.float64)
+    readings = torch.tensor([one.reading for one in found], dtype=torch.float64)
+    pan, tilt = readings.unbind(1)
     beside = plane_distance(plane[None], ray, pan[None], tilt[None])[0]
     return ScannedLine(
         points=np.array([one.pixel for one in found]),
@@ -222,13 +221,3 @@ def _ideal(view: View, ray: Tensor, pan: float, tilt: float) -> np.ndarray:
     pose = torch.tensor([pan, tilt], dtype=torch.float64)
     image = project(to_camera(ray, *pose)).numpy()
     return view.principal_point + view.focal_lengths.numpy() * image
-
-
-def _mean_pan(one: Observation) -> float:
-    """Mean of both readings, on the circle."""
-    before, after = one.read_before.pan, one.read_after.pan
-    return before + math.remainder(after - before, 2 * math.pi) / 2
-
-
-def _mean_tilt(one: Observation) -> float:
-    return (one.read_before.tilt + one.read_after.tilt) / 2

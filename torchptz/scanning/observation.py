@@ -63,6 +63,13 @@ class Observation:
         """Whether the feature was found."""
         return self.pixel is not None
 
+    @property
+    def reading(self) -> tuple[float, float]:
+        """Pan and tilt, rad: the mean of both readings, of pans on the circle."""
+        before, after = self.read_before, self.read_after
+        pan = before.pan + math.remainder(after.pan - before.pan, 2 * math.pi) / 2
+        return pan, (before.tilt + after.tilt) / 2
+
 
 class Observer:
     """Moves a camera, waits until it is at rest and looks for the feature.

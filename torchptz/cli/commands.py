@@ -1,8 +1,4 @@
-"""The command ``torchptz``. Every command is a library function; this file only talks.
-
-Exit codes: 0 everything succeeded; 1 a part failed, the rest is there; 2 nothing succeeded, or the
-command was called wrongly; 130 interrupted.
-"""
+"""The commands of ``torchptz``: every one is a library function, this file only talks."""
 
 from __future__ import annotations
 
@@ -12,15 +8,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
-from rich import box
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
+
+from torchptz.cli.options import estimation_options
+from torchptz.cli.printing import counting, fleet_progress, one_line, print_summary
 
 # What takes long to load is imported where it is used.
 
@@ -30,51 +23,6 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _OUT = click.Path(file_okay=False, path_type=Path)
 
 logger = logging.getLogger(__name__)
-
-
-class _Powers(click.ParamType):
-    """A list such as 1,2,3, or auto."""
-
-    name = "numbers"
-
-    def convert(self, value, param, ctx):
-        if isinstance(value, tuple) or value == "auto":
-            return value
-        try:
-            return tuple(float(part) for part in value.split(","))
-        except ValueError:
-            self.fail(f"{value!r} is neither auto nor a list such as 1,2,3", param, ctx)
-
-
-_ESTIMATION = (
-    click.option(
-        "--powers",
-        type=_Powers(),
-        default="1,2,3",
-        show_default=True,
-        help="Powers of r in the lens; auto: whichever predict best.",
-    ),
-    click.option(
-        "--method",
-        type=click.Choice(["ml", "lanz"]),
-        default="ml",
-        show_default=True,
-        help="Maximum likelihood, or the paper's iteration.",
-    ),
-    click.option(
-        "--robust/--no-robust",
-        default=True,
-        show_default=True,
-        help="Set outlying points and lines aside; of method ml.",
-    ),
-)
-
-
-def _estimation(command: Callable) -> Callable:
-    """Adds the options of how lenses are estimated."""
-    for option in reversed(_ESTIMATION):
-        command = option(command)
-    return command
 
 
 class _Commands(click.Group):
@@ -91,7 +39,7 @@ class _Commands(click.Group):
             if not _is_expected(error):
                 raise
             logger.debug("traceback", exc_info=True)
-            click.echo(f"torchptz: {_one_line(error)}", err=True)
+            click.echo(f"torchptz: {one_line(error)}", err=True)
             ctx.exit(2)
 
 
@@ -161,7 +109,7 @@ def collect(
     if source.is_dir():
         if board is None:
             raise click.UsageError("photographs need --board, the inner corners, such as 9x6")
-        with _counting("photographs") as progress:
+        with counting("photographs") as progress:
             found = collect_photographs(source, out, parse_board(board), name, progress, **optics)
         for photograph, reason in found.skipped.items():
             click.echo(f"skipped: {photograph} {reason}", err=True)
@@ -185,45 +133,49 @@ def collect(
 def _collect_fleet(config: Path, out: Path) -> None:
     from torchptz.fleet.calibrate import collect_fleet
 
-    with _fleet_progress() as progress:
+    with fleet_progress() as progress:
         records = collect_fleet(config, out, progress)
     for name, record in records.items():
         lines = sum(zoom.lines for zoom in record.zooms)
         click.echo(f"{out / name}: {len(record.zooms)} zooms, {lines} lines")
         if record.error is not None:
-            click.echo(f"failed: {_one_line(record.error)}", err=True)
+            click.echo(f"failed: {one_line(record.error)}", err=True)
     failed = sum(record.error is not None for record in records.values())
     _exit(failed == 0, failed == len(records))
 
 
 @main.command()
 @click.argument("run", type=_OUT)
-@_estimation
+@estimation_options
 @click.option(
     "--without-offsets",
     is_flag=True,
     help="Ignore the points' known offsets, for comparison; all points are used then.",
 )
 def solve(run: Path, without_offsets: bool, **estimation: object) -> None:
-    """Estimate the lenses of all cameras and zooms collected in RUN; write a table for each."""
+    """Estimate the lenses of all cameras and zooms collected in RUN; write a table for each.
+
+    Cameras that were collected with their heads are calibrated from all their poses, heads
+    included; photographs and sets of lines from their lines.
+    """
     from torchptz.fleet.solve import solve
 
     summary = solve(run, offsets=not without_offsets, **estimation)
-    _print_summary(summary, run)
+    print_summary(summary, run)
     _exit(summary.all_ok, summary.none_ok)
 
 
 @main.command()
 @click.argument("config", type=_FILE)
 @click.option("--out", "-o", type=_OUT, required=True, help="Folder of the run.")
-@_estimation
+@estimation_options
 def calibrate(config: Path, out: Path, **estimation: object) -> None:
     """Collect and solve the fleet of CONFIG: one table of lenses a camera."""
     from torchptz.fleet.calibrate import calibrate
 
-    with _fleet_progress() as progress:
+    with fleet_progress() as progress:
         summary = calibrate(config, out, progress=progress, **estimation)
-    _print_summary(summary, out)
+    print_summary(summary, out)
     _exit(summary.all_ok, summary.none_ok)
 
 
@@ -261,7 +213,7 @@ def rectify(
     from torchptz.fleet.pictures import rectify_pictures
     from torchptz.zoom_table import ZoomTable
 
-    with _counting("pictures") as progress:
+    with counting("pictures") as progress:
         done = rectify_pictures(
             ZoomTable.load(table),
             pictures,
@@ -273,7 +225,7 @@ def rectify(
             progress=progress,
         )
     for path, reason in done.failed.items():
-        click.echo(f"failed: {path}: {_one_line(reason)}", err=True)
+        click.echo(f"failed: {path}: {one_line(reason)}", err=True)
     click.echo(f"{len(done.written)} pictures rectified into {out}")
     _exit(not done.failed, not done.written)
 
@@ -305,93 +257,6 @@ def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
     serve(config, truth, announce, until=stop)
 
 
-def _print_summary(summary, run: Path) -> None:
-    # In a file or a pipe there is no terminal whose width would be a reason to cut rows.
-    console = Console(width=None if sys.stdout.isatty() else 120)
-    console.print(_summary_table(summary, f"Lenses of {run}"))
-    for name, camera in summary.cameras.items():
-        if camera.error is not None:
-            click.echo(f"{name}: {_one_line(camera.error)}", err=True)
-        for zoom in camera.zooms:
-            if zoom.error is not None:
-                click.echo(f"{name}, zoom {zoom.magnification:.4g}: {zoom.error}", err=True)
-
-
-def _summary_table(summary, title: str) -> Table:
-    """A row a zoom, of one line on 80 columns."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
-    table.caption = "px; sigma: of the worst point, by noise + by what the head may be off"
-    table.caption_justify = "left"
-    # Where that is too narrow, a long name is cut and no number.
-    table.add_column("camera", overflow="ellipsis")
-    for heading in ("zoom", "status", "rms", "sigma", "gain", "centre"):
-        table.add_column(heading, justify="left" if heading == "status" else "right", no_wrap=True)
-    for name, camera in summary.cameras.items():
-        for zoom in camera.zooms:
-            sigma = "" if zoom.gain_sigma is None else f"±{zoom.gain_sigma:.3f}"
-            table.add_row(
-                name,
-                f"{zoom.magnification:.4g}",
-                _short(zoom.status),
-                "" if zoom.rms_px is None else f"{zoom.rms_px:.3f}",
-                _sigmas(zoom),
-                "" if zoom.gain is None else f"{zoom.gain:.3f}{sigma}",
-                "" if zoom.center is None else f"{zoom.center[0]:.1f},{zoom.center[1]:.1f}",
-            )
-        if not camera.zooms:
-            table.add_row(name, "", _short(None))
-    return table
-
-
-def _sigmas(zoom) -> str:
-    """px, statistical, and systematic where that is known: 0.12+1.40."""
-    known = (zoom.sigma_px, zoom.systematic_px)
-    return "+".join(f"{s:.2f}" if s < 10 else f"{s:.1f}" for s in known if s is not None)
-
-
-def _short(status: str | None) -> str:
-    """A fit's status in a table; the sentence that explains it stands below."""
-    return "failed" if status is None else status.lower().replace("_", " ")
-
-
-@contextmanager
-def _fleet_progress() -> Iterator[Callable[[str, str, int, int], None]]:
-    """One bar a camera, or a line for everything it begins; called from the cameras' threads."""
-    from torchptz.fleet.progress import Stages
-
-    with _bars() as bars:
-        if bars.disable:
-            yield Stages(lambda line: click.echo(line, err=True))
-            return
-        tasks: dict[str, int] = {}
-
-        def progress(camera: str, what: str, done: int, total: int) -> None:
-            if camera not in tasks:
-                tasks[camera] = bars.add_task(camera, total=total)
-            bars.update(tasks[camera], description=f"{camera}: {what}", completed=done, total=total)
-
-        yield progress
-
-
-@contextmanager
-def _counting(what: str) -> Iterator[Callable[[int, int], None]]:
-    with _bars() as bars:
-        task = bars.add_task(what, total=None)
-        yield lambda done, total: bars.update(task, completed=done, total=total)
-
-
-def _bars() -> Progress:
-    console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
-
-
 def _quiet_decoders() -> None:
     """OpenCV reports unreadable files on stderr, beside and before our own words."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # read when it is first imported
@@ -402,14 +267,6 @@ def _refuse(reason: str, *options: object) -> None:
         raise click.UsageError(reason)
 
 
-def _one_line(message: object) -> str:
-    return " ".join(str(message).split())
-
-
 def _exit(all_ok: bool, none_ok: bool) -> None:
     if not all_ok:
         sys.exit(2 if none_ok else 1)
-
-
-if __name__ == "__main__":
-    main()
