@@ -11,7 +11,7 @@ from torch import Tensor
 from torchptz.calibration import parameters as at
 from torchptz.calibration.calibration import Calibration
 from torchptz.calibration.marginal import Noise
-from torchptz.calibration.misfit import growth_of
+from torchptz.calibration.misfit import misfit_of
 from torchptz.calibration.priors import Known, Priors, known_of
 from torchptz.calibration.problem import Problem
 from torchptz.calibration.refinement import Refined, inliers, refine
@@ -64,7 +64,13 @@ def calibrate(
     if powers != "auto":
         raise ValueError(f'powers are numbers, or "auto", not {powers!r}')
     first = _in_parts(observations, priors, checked_powers(_FEW), robust)
-    return _in_parts(observations, priors, checked_powers(_MANY), robust, first.growth > 1)
+    return _in_parts(
+        observations,
+        priors,
+        checked_powers(_MANY),
+        robust,
+        first.misfit.diagonal(dim1=2, dim2=3).any(2),
+    )
 
 
 def _in_parts(
@@ -97,7 +103,7 @@ def _in_parts(
     if richer is None:
         return found
     # Whether the first few are enough was seen before.
-    return replace(found, growth=torch.where(richer, found.growth, 1.0))
+    return replace(found, misfit=torch.where(richer[..., None, None], found.misfit, 0.0))
 
 
 def _calibrated(
@@ -200,7 +206,7 @@ def _summed_up(
         layout=layout,
         theta=refined.theta,
         covariance=refined.covariance,
-        growth=torch.ones_like(rms),
+        misfit=rms.new_zeros(*rms.shape, 2 + layout.powers, 2 + layout.powers),
         known=known,
         reading_sigma=refined.noise.head.sqrt(),
         noise_factor=refined.noise.pixel.sqrt(),
@@ -211,5 +217,5 @@ def _summed_up(
         iterations=refined.iterations,
         status=[[] for _ in o.camera],
     )
-    grown = replace(calibration, growth=growth_of(chosen, refined, known))
+    grown = replace(calibration, misfit=misfit_of(chosen, refined, known))
     return replace(grown, status=statuses(calibration, grown, seen, kept, refined.converged))

@@ -37,7 +37,8 @@ class Calibration(Batched):
     layout: Layout  # of theta
     theta: Tensor  # (C, T) all unknowns, as `torchptz.calibration.parameters` orders them
     covariance: Tensor  # (C, T, T), of theta
-    growth: Tensor  # (C, Z) by which that of a zoom's lens grows, since its powers cannot follow it
+    # (C, Z, 2+K, 2+K) of (cx, cy, l...), to be added for what the powers cannot follow
+    misfit: Tensor
     known: Known  # priors of theta
     reading_sigma: Tensor  # (C, 2) rad, of what a stop reads of its pan and tilt, as found
     noise_factor: Tensor  # (C,) noise in the picture over its stated sigma, as found
@@ -165,7 +166,9 @@ class Calibration(Batched):
         camera, zoom = self.pairs.unbind(1)
         columns = self._intrinsics_columns()[camera, zoom]
         covariance = columns @ self.covariance[camera] @ columns.mT
-        return covariance * self.growth[camera, zoom, None, None]
+        size = 2 + len(self.powers)
+        covariance[:, :size, :size] += self.misfit[camera, zoom]
+        return covariance
 
     def _intrinsics_columns(self) -> Tensor:
         """(C, Z, 5+K, T) derivatives of a zoom's intrinsics by theta."""

@@ -22,11 +22,14 @@ _CLEAR = 3.0  # standard deviations by which more powers must explain the points
 _GRID = (9, 7)
 
 
-def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
-    """By how much the covariance of a zoom's lens is too small since its powers cannot follow it.
+def misfit_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
+    """What the powers of each lens leave out, as a covariance to be added to its own.
 
     One more step with two more powers at every zoom tells, without another solution, whether they
-    would explain the points clearly better and how far they would move the undistorted picture.
+    would explain the points clearly better and how far they would move the undistorted picture. By
+    so much, in the mean over the picture, what is added lets its points move, in those directions
+    in which the lens is known least while all else is held. A similarity of the picture is no
+    misfit: pose and focal length take it up.
 
     Args:
         problem: C cameras, with the weights of the solution.
@@ -34,13 +37,11 @@ def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
         known: priors.
 
     Returns:
-        (C, Z), 1 where more powers would not help. With the covariance times this, the variance of
-        the picture's points is larger by the square of what they would move, in the mean over the
-        picture.
+        (C, Z, 2+K, 2+K) of (cx, cy, l...), 0 where more powers would not help.
 
     Source: score test (Rao 1948) and its one-step estimate; Hausman 1978 for what is chance.
     """
-    rich, theta, priors, places = _with_more_powers(problem, refined.theta, known)
+    rich, theta, priors, own = _with_more_powers(problem, refined.theta, known)
     prediction = predict(rich, theta)
     metric = metric_of(rich, prediction.by_pose, refined.noise)
     residual = torch.where(rich.used.unsqueeze(-1), rich.pixel - prediction.pixel, 0.0)
@@ -49,48 +50,50 @@ def growth_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     matrix = held_out(normal.matrix + torch.diag_embed(priors.information), free)
     right = normal.right + priors.information * (priors.mean - theta)
     covariance, failed = inverse(matrix)
+    covariance = covariance * (free[:, :, None] & free[:, None])
     step = (covariance @ torch.where(free, right, 0.0).unsqueeze(-1)).squeeze(-1)
 
-    layout = rich.layout
-    each = torch.arange(layout.zooms, device=theta.device)[:, None] * layout.per_zoom
-    extra = each + torch.tensor([at.COEFFICIENTS + place for place in places], device=theta.device)
-    moved = step[:, extra]  # (C, Z, more)
-    block = covariance[:, extra[:, :, None], extra[:, None]]  # (C, Z, more, more)
-    wald = (moved * torch.linalg.solve_ex(block, moved.unsqueeze(-1)).result.squeeze(-1)).sum(-1)
+    places = _places_of_lenses(rich)  # (Z, 2 + K + more)
+    columns = _shape(rich, theta)  # (C, Z, 2 G, 2 + K + more)
+    count = places.shape[1]
+    extra = [column for column in range(count) if column not in own]
+    moved, block = step[:, places], _blocks(covariance, places)
+    by_more, of_more = moved[..., extra], block[..., extra, :][..., extra]
+    solved = torch.linalg.solve_ex(of_more, by_more.unsqueeze(-1)).result.squeeze(-1)
     # Chi-squared, by Wilson and Hilferty's approximation.
-    more = len(places)
-    spread = (2 / (9 * more)) ** 0.5
-    clear = (wald > more * (1 - spread**2 + _CLEAR * spread) ** 3) & ~failed[:, None]
+    spread = (2 / (9 * len(extra))) ** 0.5
+    limit = len(extra) * (1 - spread**2 + _CLEAR * spread) ** 3
+    clear = ((by_more * solved).sum(-1) > limit) & ~failed[:, None]
 
-    columns, index, inside = _rays(rich, theta)
-    distance = (columns @ step[:, index].unflatten(2, (1, -1, 1))).square().sum((-2, -1))
-    known_rich = covariance * (free[:, :, None] & free[:, None])
-    own_columns, own_index, _ = _rays(problem, refined.theta)
-    variance = _variance(own_columns, own_index, refined.covariance)
+    before = _blocks(refined.covariance, _places_of_lenses(problem))
+    alone, lost = inverse(_blocks(matrix, places)[..., own, :][..., own].flatten(0, 1))
+    alone = torch.where(lost[:, None, None], 0.0, alone).unflatten(0, clear.shape)
     # More powers know less, and move the picture by so much by chance alone.
-    chance = _variance(columns, index, known_rich) - variance
-    move, spread = (torch.where(inside, one, 0.0).sum(2) for one in (distance - chance, variance))
-    ratio = (move / spread.clamp_min(1e-300)).clamp_min(0)
-    return torch.where(clear & ratio.isfinite(), 1 + ratio, 1.0)
+    chance = _trace(columns, block) - _trace(columns[..., own], before)
+    distance = (columns @ moved.unsqueeze(-1)).square().sum((-2, -1)) - chance
+    share = distance / _trace(columns[..., own], alone).clamp_min(1e-300)
+    clear = clear & (share > 0) & share.isfinite()
+    return torch.where(clear, share, 0.0)[..., None, None] * alone
 
 
-def _rays(problem: Problem, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """How the rays of picture points depend on the unknowns of their zoom.
+def _places_of_lenses(problem: Problem) -> Tensor:
+    """(Z, 2+K) places in theta of each lens: how its centre lies, and its coefficients."""
+    layout = problem.layout
+    each = torch.arange(layout.zooms, device=problem.pixel.device)[:, None] * layout.per_zoom
+    first = at.DECENTERING.start
+    return each + torch.arange(first, layout.pupil, device=each.device)
 
-    Where a lens is stretched and its focal length is longer by as much, no ray moves.
 
-    Returns:
-        (C, Z, G, 2, M) derivatives, px of the undistorted picture; (Z, M) the places in theta that
-        they belong to; (C, Z, G) bool, points with a ray.
-    """
+def _shape(problem: Problem, theta: Tensor) -> Tensor:
+    """(C, Z, 2 G, 2+K) px by which lenses move a grid of undistorted points, similarities left out
+    and what is beyond a fold, per unit of (cx, cy, l...)."""
     layout = problem.layout
     zooms, head, _ = layout.split(theta)
-    point = (head[:, None, at.POINT] + zooms[..., at.WANDER]).flatten(0, 1)
-    zooms = zooms.flatten(0, 1)
+    center = head[:, None, at.POINT] + zooms[..., at.WANDER] + zooms[..., at.DECENTERING]
     size = problem.image_size.repeat_interleave(layout.zooms, 0)
     lens = RadialLens(
-        point + zooms[:, at.DECENTERING],
-        zooms[:, at.COEFFICIENTS : layout.pupil],
+        center.flatten(0, 1),
+        zooms[..., at.COEFFICIENTS : layout.pupil].flatten(0, 1),
         problem.powers,
         None,
         size,
@@ -98,34 +101,34 @@ def _rays(problem: Problem, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     )
     axes = [torch.arange(n, dtype=torch.float64) / (n - 1) for n in _GRID]
     grid = torch.cartesian_prod(*axes).to(theta) * size[:, None] - 0.5
-    by_lens = undistort_jacobian(lens, grid)  # (CZ, G, 2, 2 + K)
-    by_center, by_coefficients = by_lens[..., :2], by_lens[..., 2:]
-    by_point = by_center - torch.eye(2).to(theta)
-    away = (lens.undistort(grid) - point[:, None]).nan_to_num(0.0).unsqueeze(-1)
-    nothing = torch.zeros_like(away)
-    columns = [-away, by_point, by_center, by_coefficients, nothing, by_point]
-    each = torch.arange(layout.zooms, device=theta.device)[:, None] * layout.per_zoom
-    own = each + torch.arange(layout.per_zoom, device=theta.device)
-    shared = layout.zooms * layout.per_zoom + torch.arange(2, device=theta.device)
-    index = torch.cat([own, shared.expand(layout.zooms, 2)], 1)
-    shape = (len(theta), layout.zooms)
-    return (
-        torch.cat(columns, -1).unflatten(0, shape),
-        index,
-        lens.is_valid(grid).unflatten(0, shape),
+    inside = lens.is_valid(grid)[..., None, None]
+    x, y = (lens.undistort(grid) - lens.center[:, None]).unbind(-1)
+    one, nothing = torch.ones_like(x), torch.zeros_like(x)
+    alike = torch.stack(
+        [torch.stack([one, nothing, x, -y], -1), torch.stack([nothing, one, y, x], -1)], -2
     )
+    alike = torch.where(inside, alike, 0.0).flatten(1, 2)
+    columns = torch.where(inside, undistort_jacobian(lens, grid), 0.0).flatten(1, 2)
+    basis = torch.linalg.qr(alike).Q
+    columns = columns - basis @ (basis.mT @ columns)
+    return columns.unflatten(0, (len(theta), layout.zooms))
 
 
-def _variance(columns: Tensor, index: Tensor, covariance: Tensor) -> Tensor:
-    """(C, Z, G) px², of points with derivatives (C, Z, G, 2, M) by what ``index`` (Z, M) says."""
-    own = covariance[:, index[:, :, None], index[:, None]]  # (C, Z, M, M)
-    return ((columns.flatten(2, 3) @ own).unflatten(2, columns.shape[2:4]) * columns).sum((-2, -1))
+def _blocks(matrix: Tensor, places: Tensor) -> Tensor:
+    """(C, Z, M, M) of (C, T, T), by what ``places`` (Z, M) says."""
+    return matrix[:, places[:, :, None], places[:, None]]
+
+
+def _trace(columns: Tensor, covariance: Tensor) -> Tensor:
+    """(C, Z) px², mean-square moves of the grid times its size."""
+    return ((columns @ covariance) * columns).sum((-2, -1))
 
 
 def _with_more_powers(
     problem: Problem, theta: Tensor, known: Known
 ) -> tuple[Problem, Tensor, Known, list[int]]:
-    """Problem, unknowns and priors with coefficients of 0 added, and the places of these."""
+    """Problem, unknowns and priors with coefficients of 0 added, and which of the columns of
+    (cx, cy, l...) were there before."""
     own = problem.powers.tolist()
     missing = (float(p) for p in range(1, len(own) + _MORE_POWERS + 1) if float(p) not in own)
     more = [next(missing) for _ in range(_MORE_POWERS)]
@@ -147,4 +150,4 @@ def _with_more_powers(
     vague = problem.layout.split(known.sigma)[0][..., at.COEFFICIENTS, None]
     rich = replace(problem, layout=layout, powers=torch.tensor(powers).to(problem.powers))
     priors = Known(embedded(known.mean, 0.0), embedded(known.sigma, vague))
-    return rich, embedded(theta, 0.0), priors, [powers.index(power) for power in more]
+    return rich, embedded(theta, 0.0), priors, [0, 1, *(2 + powers.index(p) for p in own)]
