@@ -22,8 +22,9 @@ from torchptz.observations import Observations
 
 _VAGUE_FOCAL = 0.5  # relative, about the start, where no prior tells: keeps a lone look solvable
 _ROUGH_ROUNDS, _SETTLED_ROUGHLY = 5, 0.1  # until outliers can be told
-_SELECTIONS = 3  # times that inliers are chosen
+_SELECTIONS = 3  # times that inliers are chosen again
 _FEW, _MANY = (1, 2, 3), (1, 2, 3, 4, 5)  # powers that "auto" chooses from
+_STRANGE = 10.0  # times a sigma that was assumed
 _CHUNK = 2**25  # numbers in the largest tensor of a part of the batch
 
 
@@ -115,26 +116,33 @@ def _calibrated(
     robust: bool,
 ) -> Calibration:
     theta, known = _started(problem, observations, known, noise)
-    assumed = noise if learn else None
+    noise_assumed, assumed = noise, noise if learn else None
     if robust:
-        # Before outliers are told from a start that is off, nothing is learnt from them.
+        # Before outliers are told from a start that is off, nothing is learnt from them, and no
+        # zoom gets its way with what others depend on.
         rough = {"heavy_tails": True, "settled": _SETTLED_ROUGHLY, "rounds": _ROUGH_ROUNDS}
-        far = refine(problem, theta, known, noise, **rough)
+        lenses = refine(problem, theta, known.of_lenses(problem.layout), noise, **rough)
+        far = refine(problem, lenses.theta, known, noise, **rough)
         near = refine(problem, far.theta, known, noise, assumed=assumed, **rough)
-        taken = far.iterations + near.iterations
+        taken = lenses.iterations + far.iterations + near.iterations
         theta, noise = near.theta, near.noise
         good = inliers(problem, near)
     else:
         good, taken = problem.used, torch.zeros_like(known.mean[:, 0], dtype=torch.long)
-    for _ in range(_SELECTIONS if robust else 1):
-        chosen = problem.using(good.to(problem.weight))
-        refined = refine(chosen, theta, known, noise, assumed=assumed)
-        taken = taken + refined.iterations
-        theta, noise = refined.theta, refined.noise
-        before, good = good, inliers(problem, refined) if robust else good
-        if bool((good == before).all()):
+    chosen = problem.using(good.to(problem.weight))
+    refined = refine(chosen, theta, known, noise, assumed=assumed)
+    for _ in range(_SELECTIONS if robust else 0):
+        good = inliers(problem, refined)
+        changed = (good != chosen.used).any(1)
+        if not bool(changed.any()):
             break
-    return _summed_up(observations, problem, chosen, known, replace(refined, iterations=taken))
+        # Those whose inliers stand are done, whatever becomes of the others.
+        chosen = problem.using(torch.where(changed[:, None], good.to(chosen.weight), chosen.weight))
+        again = refine(chosen, refined.theta, known, refined.noise, assumed=assumed)
+        again = replace(again, iterations=refined.iterations + again.iterations)
+        refined = again.where(changed, refined)
+    refined = replace(refined, iterations=taken + refined.iterations)
+    return _summed_up(observations, problem, chosen, known, refined, noise_assumed)
 
 
 def _assumed_noise(priors: Priors, o: Observations) -> Noise:
@@ -188,7 +196,12 @@ def _start_with_priors(problem: Problem, o: Observations, known: Known) -> tuple
 
 
 def _summed_up(
-    o: Observations, problem: Problem, chosen: Problem, known: Known, refined: Refined
+    o: Observations,
+    problem: Problem,
+    chosen: Problem,
+    known: Known,
+    refined: Refined,
+    assumed: Noise,
 ) -> Calibration:
     layout = problem.layout
     level = torch.arange(layout.zooms, device=o.zoom.device)
@@ -218,4 +231,9 @@ def _summed_up(
         status=[[] for _ in o.camera],
     )
     grown = replace(calibration, misfit=misfit_of(chosen, refined, known))
-    return replace(grown, status=statuses(calibration, grown, seen, kept, refined.converged))
+    # Beyond what any head or detection does, it is not noise.
+    strange = (refined.noise.head > _STRANGE**2 * assumed.head).any(1)
+    strange |= refined.noise.pixel > _STRANGE**2 * assumed.pixel
+    return replace(
+        grown, status=statuses(calibration, grown, seen, kept, refined.converged, strange)
+    )

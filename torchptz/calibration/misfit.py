@@ -18,7 +18,7 @@ from torchptz.displacement import undistort_jacobian
 from torchptz.lens import RadialLens
 
 _MORE_POWERS = 2
-_CLEAR = 3.0  # standard deviations by which more powers must explain the points better
+_CLEAR = 2.0  # standard deviations by which more powers must explain the points better
 _GRID = (9, 7)
 
 

@@ -64,7 +64,7 @@ class Priors:
     principal_point_sigma: Tensor | float = 15.0
     wander_sigma: Tensor | float = 3.0
     decentering_sigma: Tensor | float = 5.0
-    coefficient_sigma: Tensor | float = 1.0
+    coefficient_sigma: Tensor | float = 0.1
     tilt_zero_sigma: Tensor | float = _DEGREE
     boresight_sigma: Tensor | float = _DEGREE
     roll_sigma: Tensor | float = 2 * _DEGREE
@@ -125,6 +125,14 @@ class Known(Batched):
         more = levels[..., at.COEFFICIENTS + first : layout.pupil]
         more.masked_fill_(zooms.unsqueeze(-1), 0.0)
         return Known(self.mean, layout.join(levels, head, features))
+
+    def of_lenses(self, layout: Layout) -> Known:
+        """The same with all held but the zooms' lenses, the principal point and the roll."""
+        zooms, head, features = layout.split(self.sigma)
+        zooms, kept = zooms.clone(), torch.zeros_like(head)
+        zooms[..., layout.pupil] = 0.0
+        kept[:, at.POINT], kept[:, at.ROLL] = head[:, at.POINT], head[:, at.ROLL]
+        return Known(self.mean, layout.join(zooms, kept, torch.zeros_like(features)))
 
     def value(self, theta: Tensor) -> Tensor:
         """(C,) sum of squared standardised distances."""

@@ -13,6 +13,8 @@ from torchptz.calibration.parameters import Layout
 from torchptz.geometry import wrap_angle
 from torchptz.observations import Observations
 
+_FINEST = 1e-4  # px: no detection is better
+
 
 @dataclass(frozen=True, eq=False)
 class Problem(Batched):
@@ -44,8 +46,8 @@ class Problem(Batched):
             layout,
             int(o.stop.max()) + 1,
             powers.to(o.pixel.device),
-            o.pixel,
-            o.sigma,
+            torch.where(used.unsqueeze(-1), o.pixel, 0.0),
+            torch.where(used, o.sigma.clamp_min(_FINEST), 1.0),
             used.double(),
             o.zoom,
             o.feature,

@@ -24,6 +24,7 @@ from torchptz.calibration.problem import Problem
 _ROUND = 5  # steps between two looks at which cameras are still active
 _MOST_ROUNDS = 16
 _DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
+_UNKNOWN = 1e6  # a sigma of what nothing is known of
 _DAMPING_AT_KINK = 5.0
 # A step's promised fall of the cost is its squared length in standard deviations.
 _CONVERGED, _SETTLED = 1e-4, 1e-9
@@ -139,17 +140,18 @@ def _advance(
     for _ in range(_ROUND):
         prediction = predict(problem, theta)
         residual = _residual(problem, prediction.pixel)
-        spread = torch.ones_like(damping)
         if heavy_tails:
             squared = distances(problem, prediction.by_pose, noise, residual)
-            spread = _median(squared, used).div(_MEDIAN).clamp_min(1.0)
-            likely = (_HEAVY + 2) / (_HEAVY + squared / spread[:, None])
+            spread = torch.ones_like(squared)
+            if assumed is None:  # what the noise does not explain, a start does that is off
+                spread = _spread(problem, squared)
+            likely = (_HEAVY + 2) / (_HEAVY * spread + squared)
             weight = torch.where(active[:, None], torch.where(used, likely, 0.0), weight)
         weighed = problem.using(weight)
         metric = metric_of(weighed, prediction.by_pose, noise)
         normal = normal_of(weighed, metric, prediction, residual)
-        matrix = normal.matrix / spread[:, None, None] + torch.diag_embed(known.information)
-        right = normal.right / spread[:, None] + known.information * (known.mean - theta)
+        matrix = normal.matrix + torch.diag_embed(known.information)
+        right = normal.right + known.information * (known.mean - theta)
         # A play of nothing that wants to be less stays where it is. So does one at a kink: where it
         # is as wide as a step of the head, another step begins to take it up or ceases to.
         moves = free & ~(plays & (((theta <= 0) & (right < 0)) | play_held[:, None]))
@@ -159,15 +161,15 @@ def _advance(
         step = _solve(matrix, right, damping)
         trial = _within(problem, theta + step)
 
-        level = cost(weighed, metric, residual) / spread + known.value(theta)
+        level = cost(weighed, metric, residual) + known.value(theta)
         seen = _residual(problem, predict(problem, trial, derivatives=False).pixel)
-        trial_level = cost(weighed, metric, seen) / spread + known.value(trial)
+        trial_level = cost(weighed, metric, seen) + known.value(trial)
         better = active & (trial_level <= level + 1e-9 * (1 + level))
         iterations = iterations + active
         change = torch.zeros_like(damping)
         if assumed is not None:
             covariance = _of_free(inverse(matrix)[0], moves)
-            freedom = _freedom(problem, known, covariance)
+            freedom = _freedom(problem, known, moves, covariance)
             wanted = learned_noise(
                 weighed, metric, noise, normal, covariance, freedom, residual, assumed
             )
@@ -197,7 +199,7 @@ def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:
     matrix = held_out(normal.matrix + torch.diag_embed(known.information), known.free)
     covariance, failed = inverse(matrix)
     covariance = _of_free(covariance, known.free)
-    nothing = torch.diag_embed(torch.where(known.free, known.sigma**2, 0.0))
+    nothing = torch.diag_embed(torch.where(known.free, known.sigma.clamp(max=_UNKNOWN) ** 2, 0.0))
     return Refined(
         theta,
         noise,
@@ -206,7 +208,7 @@ def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:
         distances(problem, prediction.by_pose, noise, residual),
         residual,
         cost(problem, metric, residual),
-        _freedom(problem, known, covariance),
+        _freedom(problem, known, known.free, covariance),
         progress.iterations,
         progress.converged & ~failed,
     )
@@ -218,13 +220,15 @@ def inliers(problem: Problem, refined: Refined) -> Tensor:
 
 
 def _residual(problem: Problem, pixel: Tensor) -> Tensor:
-    return torch.where(problem.used.unsqueeze(-1), problem.pixel - pixel, 0.0)
+    """(C, N, 2) px, also of what is not used: it may turn out to be right."""
+    return problem.pixel - pixel
 
 
-def _freedom(problem: Problem, known: Known, covariance: Tensor) -> Tensor:
-    """(C,) observed coordinates less the unknowns that they, and not the priors, determine."""
+def _freedom(problem: Problem, known: Known, moves: Tensor, covariance: Tensor) -> Tensor:
+    """(C,) observed coordinates less the unknowns that they, and not the priors, determine, of
+    those that move (C, T)."""
     told = known.information * covariance.diagonal(dim1=1, dim2=2)
-    determined = (known.free * (1 - told).clamp(0, 1)).sum(1)
+    determined = (moves * (1 - told).clamp(0, 1)).sum(1)
     return (2 * problem.used.sum(1) - determined).clamp_min(1.0)
 
 
@@ -280,6 +284,11 @@ def inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cholesky_inverse(factor) / (size[:, :, None] * size[:, None]), failed
 
 
-def _median(values: Tensor, used: Tensor) -> Tensor:
-    """(C,) median of those used; 0 where there are none."""
-    return torch.where(used, values, torch.nan).nanmedian(1).values.nan_to_num(0.0)
+def _spread(problem: Problem, squared: Tensor) -> Tensor:
+    """(C, N) by how much squared distances are larger than noise makes them, zoom by zoom: a start
+    without distortion is off by many standard deviations at the wide end, and by none at the long
+    one."""
+    level = torch.arange(problem.layout.zooms, device=squared.device)[:, None]
+    there = problem.used[:, None] & (problem.zoom[:, None] == level)  # (C, Z, N)
+    median = torch.where(there, squared[:, None], torch.nan).nanmedian(2).values
+    return (median / _MEDIAN).nan_to_num(1.0).clamp_min(1.0).gather(1, problem.zoom)

@@ -12,6 +12,8 @@ from torchptz.geometry import pan_tilt_from_ray, ray_from_pan_tilt, ray_through_
 from torchptz.observations import Observations
 
 _NEIGHBOURS = (1, 2, 3, 5, 8, 13)  # looks that are compared with those before
+# Of the pairs' answers, which is taken: wrong detections move farther than the feature does.
+_QUANTILE = 0.35
 _FEWEST_QUANTA = 1.5  # between the poses of a pair that tells the focal length
 _USUAL_FOV = 0.92  # rad, of a lens at its wide end, where neither priors nor readings tell
 
@@ -20,7 +22,7 @@ def start_of(problem: Problem, observations: Observations, known: Known) -> Tens
     """A first guess (C, T) without distortion, good to some per cent.
 
     A feature moves in the picture by the angle between two poses of the head times the focal
-    length, whatever its direction is; the median over many pairs is good enough to start with.
+    length, whatever its direction is; what most of many pairs say is good enough to start with.
     Its ray then is the median of those through its pixels.
 
     Args:
@@ -60,8 +62,10 @@ def _focal_lengths(problem: Problem, o: Observations) -> Tensor:
     length, zoom = torch.cat(lengths, 1), torch.cat(where, 1)
     level = torch.arange(o.zooms.shape[1], device=zoom.device)[:, None]
     at_zoom = torch.where(zoom[:, None] == level, length[:, None], torch.nan)  # (C, Z, pairs)
-    median = at_zoom.nanmedian(2).values
-    return torch.where(median > 0, median, torch.nan)
+    ordered = at_zoom.sort(2).values  # NaN last
+    chosen = (_QUANTILE * at_zoom.isfinite().sum(2, keepdim=True)).long()
+    length = ordered.gather(2, chosen.clamp(max=ordered.shape[2] - 1)).squeeze(2)
+    return torch.where(length > 0, length, torch.nan)
 
 
 def _filled(focal: Tensor, o: Observations) -> Tensor:

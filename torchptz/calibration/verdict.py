@@ -19,9 +19,14 @@ if TYPE_CHECKING:
 
 
 def statuses(
-    calibration: Calibration, grown: Calibration, seen: Tensor, kept: Tensor, converged: Tensor
+    calibration: Calibration,
+    grown: Calibration,
+    seen: Tensor,
+    kept: Tensor,
+    converged: Tensor,
+    strange: Tensor,
 ) -> list[list[Status]]:
-    """Status of each zoom, the most basic failure first; OK for zooms that do not exist.
+    """Status of each zoom, the most basic failure first; OK for zooms that a camera does not have.
 
     Args:
         calibration: of C cameras, as if the powers could follow their lenses.
@@ -29,6 +34,7 @@ def statuses(
         seen: (C, Z) observations.
         kept: (C, Z) inliers.
         converged: (C,) bool.
+        strange: (C,) bool, cameras whose noise is no noise.
     """
     lens = calibration.lens
     camera, zoom = calibration.pairs.unbind(1)
@@ -44,12 +50,17 @@ def statuses(
             kept[camera, zoom] < INLIER_SHARE_LIMIT * seen[camera, zoom],
         ),
         (Status.TOO_FEW_LINES, few),
+        (Status.INCONSISTENT, strange[camera]),
         (Status.MISFIT, moved & known),
         (Status.DISTORTION_UNOBSERVABLE, ~known),
         (Status.NOT_CONVERGED, ~converged[camera]),
         (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
     ]
-    table = [[Status.OK] * calibration.layout.zooms for _ in calibration.camera]
+    unseen = calibration.zooms.isfinite() & ~calibration.exists
+    table = [
+        [Status.TOO_FEW_LINES if nothing else Status.OK for nothing in row]
+        for row in unseen.tolist()
+    ]
     for status, applies in reversed(reasons):
         for c, z in zip(camera[applies].tolist(), zoom[applies].tolist(), strict=True):
             table[c][z] = status

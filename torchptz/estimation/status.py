@@ -47,6 +47,10 @@ class Status(Enum):
         "too many points lie off their lines to tell which are right: look at the pattern, and "
         "collect it again"
     )
+    INCONSISTENT = (
+        "what was seen does not move as the head reads: check the signs and units of its axes, and "
+        "what was detected"
+    )
     MISFIT = "the powers cannot follow this lens: use others, or leave the choice to auto"
     NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
 
