@@ -35,7 +35,7 @@ class Settings:
 
 def simulation() -> SimulationConfig:
     """The first camera of the simulated fleet, fast, with its board near."""
-    camera = SimulationConfig.load(CONFIG).cameras[0]
+    camera = SimulationConfig.load(CONFIG).with_perfect_bodies().cameras[0]
     scene = camera.scene.model_copy(update={"board": camera.scene.board.model_copy(update=BOARD)})
     head = camera.head.model_copy(update={"speed_up": SPEED_UP})
     return SimulationConfig(cameras=[camera.model_copy(update={"scene": scene, "head": head})])
