@@ -176,7 +176,8 @@ class Observations(Batched):
         """
         rays = ray.gather(1, self.feature.unsqueeze(-1).expand(*self.feature.shape, 3))
         image = project(to_camera(rays, *self.read.unbind(-1)))
-        aspect = torch.as_tensor(pixel_aspect).to(image).expand(len(self))
+        aspect = torch.as_tensor(pixel_aspect, dtype=image.dtype, device=image.device)
+        aspect = aspect.expand(len(self))
         square = torch.stack([torch.ones_like(aspect), aspect], -1)
         focal = focal_length.gather(1, self.zoom)
         ideal = principal_point[:, None] + focal.unsqueeze(-1) * square[:, None] * image
@@ -286,10 +287,13 @@ def _checked(number: int, one: Mapping) -> dict:
     out["pixel"] = np.where(found[:, None], out["pixel"], 0.0)
     out["sigma"] = np.where(found, out["sigma"], 1.0)
     out["zooms"], out["zoom"] = np.unique(out["zoom"], return_inverse=True)
-    out["feature"] = np.asarray(out.get("feature", np.zeros(count)), dtype=np.int64)
-    out["line"] = np.asarray(out.get("line", np.full(count, -1)), dtype=np.int64)
-    if (out["feature"] < 0).any():
-        raise ValueError(f"{where}: feature must be 0 or more")
+    for name, default in (("feature", 0), ("line", -1)):
+        numbers = out.get(name, np.full(count, float(default)))
+        if not (np.isfinite(numbers).all() and (numbers == np.rint(numbers)).all()):
+            raise ValueError(f"{where}: {name} must be whole numbers")
+        out[name] = numbers.astype(np.int64)
+    if (out["feature"] < 0).any() or (out["feature"] >= count).any():
+        raise ValueError(f"{where}: feature must count from 0 on, fewer than there are looks")
     stop = out.get("stop")
     moved = (np.diff(out["commanded"], axis=0) != 0).any(1) if stop is None else np.diff(stop) != 0
     out["stop"] = np.concatenate([[0], np.cumsum(moved)])

@@ -70,7 +70,7 @@ def calibrate(
         priors,
         checked_powers(_MANY),
         robust,
-        first.misfit.diagonal(dim1=2, dim2=3).any(2),
+        first.misfit[..., 2, 2] > 0,
     )
 
 
@@ -147,7 +147,8 @@ def _calibrated(
 
 def _assumed_noise(priors: Priors, o: Observations) -> Noise:
     """A head that stops anywhere and reports the nearest multiple of its quantum."""
-    repeatability = torch.as_tensor(priors.repeatability).to(o.quantum).reshape(-1, 1)
+    like = {"dtype": o.quantum.dtype, "device": o.quantum.device}
+    repeatability = torch.as_tensor(priors.repeatability, **like).reshape(-1, 1)
     head = (o.quantum**2 / 12 + repeatability**2).clamp_min(_FINEST_READING**2)
     return Noise(head.expand(len(o), 2), torch.ones_like(head[:, 0]))
 
@@ -219,7 +220,7 @@ def _summed_up(
         layout=layout,
         theta=refined.theta,
         covariance=refined.covariance,
-        misfit=rms.new_zeros(*rms.shape, 2 + layout.powers, 2 + layout.powers),
+        misfit=rms.new_zeros(*rms.shape, 5 + layout.powers, 5 + layout.powers),
         known=known,
         reading_sigma=refined.noise.head.sqrt(),
         noise_factor=refined.noise.pixel.sqrt(),

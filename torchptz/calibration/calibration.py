@@ -37,7 +37,7 @@ class Calibration(Batched):
     layout: Layout  # of theta
     theta: Tensor  # (C, T) all unknowns, as `torchptz.calibration.parameters` orders them
     covariance: Tensor  # (C, T, T), of theta
-    # (C, Z, 2+K, 2+K) of (cx, cy, l...), to be added for what the powers cannot follow
+    # (C, Z, 5+K, 5+K) of (cx, cy, l..., log f, ppx, ppy), added for what the powers cannot follow
     misfit: Tensor
     known: Known  # priors of theta
     reading_sigma: Tensor  # (C, 2) rad, of what a stop reads of its pan and tilt, as found
@@ -64,7 +64,9 @@ class Calibration(Batched):
     @property
     def focal_length_sigma(self) -> Tensor:
         """(C, Z) px."""
-        return self.focal_length * self._sigmas[0][..., at.LOG_FOCAL]
+        place = 2 + len(self.powers)
+        variance = self._sigmas[0][..., at.LOG_FOCAL].square() + self.misfit[..., place, place]
+        return self.focal_length * variance.sqrt()
 
     @property
     def principal_point(self) -> Tensor:
@@ -166,9 +168,9 @@ class Calibration(Batched):
         camera, zoom = self.pairs.unbind(1)
         columns = self._intrinsics_columns()[camera, zoom]
         covariance = columns @ self.covariance[camera] @ columns.mT
-        size = 2 + len(self.powers)
-        covariance[:, :size, :size] += self.misfit[camera, zoom]
-        return covariance
+        unit = torch.ones_like(covariance[:, 0])
+        unit[:, 2 + len(self.powers)] = self.focal_length[camera, zoom]
+        return covariance + unit[:, :, None] * self.misfit[camera, zoom] * unit[:, None]
 
     def _intrinsics_columns(self) -> Tensor:
         """(C, Z, 5+K, T) derivatives of a zoom's intrinsics by theta."""

@@ -29,7 +29,7 @@ def misfit_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     would explain the points clearly better and how far they would move the undistorted picture. By
     so much, in the mean over the picture, what is added lets its points move, in those directions
     in which the lens is known least while all else is held. A similarity of the picture is no
-    misfit: pose and focal length take it up.
+    misfit of the lens: focal length and principal point take it up, of which the step tells, too.
 
     Args:
         problem: C cameras, with the weights of the solution.
@@ -37,7 +37,9 @@ def misfit_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
         known: priors.
 
     Returns:
-        (C, Z, 2+K, 2+K) of (cx, cy, l...), 0 where more powers would not help.
+        (C, Z, 5+K, 5+K) of (cx, cy, l..., log f, ppx, ppy), 0 where more powers would not help.
+        Zooms of a camera share its head: what one of them lacks, focal length and principal point
+        of the others feel, too.
 
     Source: score test (Rao 1948) and its one-step estimate; Hausman 1978 for what is chance.
     """
@@ -72,8 +74,36 @@ def misfit_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     chance = _trace(columns, block) - _trace(columns[..., own], before)
     distance = (columns @ moved.unsqueeze(-1)).square().sum((-2, -1)) - chance
     share = distance / _trace(columns[..., own], alone).clamp_min(1e-300)
-    clear = clear & (share > 0) & share.isfinite()
-    return torch.where(clear, share, 0.0)[..., None, None] * alone
+    share = torch.where(clear & (share > 0) & share.isfinite(), share, 0.0)
+
+    layout = rich.layout
+    focal, point = _pinhole(layout, step.unsqueeze(-1))
+    pinhole = torch.cat([focal, point], 2).squeeze(-1)  # (C, Z, 3), moves
+    now = _pinhole_variance(layout, covariance)
+    by_chance = now - _pinhole_variance(problem.layout, refined.covariance)
+    felt = (pinhole.square() - by_chance).clamp_min(0)
+    felt = torch.where((share > 0).any(1)[:, None, None], felt, 0.0)
+    size = len(own) + 3
+    added = share.new_zeros(*share.shape, size, size)
+    added[..., : len(own), : len(own)] = share[..., None, None] * alone
+    added[..., len(own) :, len(own) :] = torch.diag_embed(felt)
+    return added
+
+
+def _pinhole(layout: Layout, columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of log f (C, Z, 1, M) and of the principal points (C, Z, 2, M) among (C, T, M)."""
+    count = layout.zooms * layout.per_zoom
+    zooms = columns[:, :count].unflatten(1, (layout.zooms, layout.per_zoom))
+    shared = columns[:, None, count : count + 2]
+    return zooms[:, :, : at.LOG_FOCAL + 1], zooms[:, :, at.WANDER] + shared
+
+
+def _pinhole_variance(layout: Layout, covariance: Tensor) -> Tensor:
+    """(C, Z, 3) variances of log f, ppx and ppy."""
+    focal, point = _pinhole(layout, covariance)  # against all unknowns
+    across = _pinhole(layout, torch.cat([focal, point], 2).flatten(1, 2).mT)
+    both = torch.cat(across, 2).unflatten(3, (layout.zooms, 3))  # (C, Z, 3, Z, 3)
+    return both.diagonal(dim1=1, dim2=3).diagonal(dim1=1, dim2=2)
 
 
 def _places_of_lenses(problem: Problem) -> Tensor:

@@ -28,6 +28,8 @@ _UNKNOWN = 1e6  # a sigma of what nothing is known of
 _DAMPING_AT_KINK = 5.0
 # A step's promised fall of the cost is its squared length in standard deviations.
 _CONVERGED, _SETTLED = 1e-4, 1e-9
+_SLACK = 1e-9  # relative, of the cost: rounding must not decide
+_KEPT = 0.25  # of a promised fall
 _SETTLED_NOISE = 1e-3  # relative change of a variance that matters
 _HEAVY = 4.0  # degrees of freedom of the Student weights
 _MEDIAN = 1.386  # of chi squared with two degrees of freedom
@@ -164,7 +166,13 @@ def _advance(
         level = cost(weighed, metric, residual) + known.value(theta)
         seen = _residual(problem, predict(problem, trial, derivatives=False).pixel)
         trial_level = cost(weighed, metric, seen) + known.value(trial)
-        better = active & (trial_level <= level + 1e-9 * (1 + level))
+        slack = _SLACK * (1 + level)
+        better = active & (trial_level <= level + slack)
+        # A step that falls short of what it promised shows how far to trust the next.
+        foreseen = (right * step).sum(-1) * 2 - (
+            step * (matrix @ step.unsqueeze(-1)).squeeze(-1)
+        ).sum(-1)
+        kept_word = level - trial_level >= _KEPT * foreseen - slack
         iterations = iterations + active
         change = torch.zeros_like(damping)
         if assumed is not None:
@@ -180,7 +188,8 @@ def _advance(
             change = torch.maximum(change, (wanted.pixel / noise.pixel).log().abs())
             noise = wanted.where(active, noise)
         theta = torch.where(better[:, None], trial, theta)
-        damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
+        damping = torch.where(better & kept_word, damping / 10, damping * 10)
+        damping = damping.clamp_min(_DAMPING_LOWEST)
         kink = active & ~play_held & (damping > _DAMPING_AT_KINK)
         play_held = play_held | kink
         damping = torch.where(kink, _DAMPING_START, damping)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 # A sigma that is no less than this part of the prior's is the prior's.
 _LEFT = 0.7
+_LOUD = 2.0  # times the stated noise
 _MATTERS = 5e-4  # relative error of a focal length
 
 
@@ -135,6 +136,18 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
                     "m",
                     "it matters as far as the entrance pupil does: measure it, and state it "
                     "(distance_m)",
+                )
+            )
+        noise = float(calibration.noise_factor[c])
+        if noise > _LOUD:
+            one.append(
+                Undetermined(
+                    "where the noise in the picture comes from",
+                    (),
+                    None,
+                    "",
+                    f"it is {noise:.2g} times what the detections state: look at them, and whether "
+                    "pixel aspect and axis scales are what they are taken for",
                 )
             )
         found.append([*one, *_GAUGES])
