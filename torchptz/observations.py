@@ -17,6 +17,7 @@ from torchptz.patterns import LinePatterns
 
 SCHEMA_VERSION = 1
 _FEWEST_ON_LINE = 3
+_FEATURES = 100  # that a camera may number, however few looks it took
 
 # Per camera, per observation: the last axes, and what stands where there is none.
 _COLUMNS: dict[str, tuple[tuple[int, ...], object]] = {
@@ -287,15 +288,18 @@ def _checked(number: int, one: Mapping) -> dict:
     out["pixel"] = np.where(found[:, None], out["pixel"], 0.0)
     out["sigma"] = np.where(found, out["sigma"], 1.0)
     out["zooms"], out["zoom"] = np.unique(out["zoom"], return_inverse=True)
-    for name, default in (("feature", 0), ("line", -1)):
+    for name, default in (("feature", 0), ("line", -1), ("stop", 0)):
         numbers = out.get(name, np.full(count, float(default)))
         if not (np.isfinite(numbers).all() and (numbers == np.rint(numbers)).all()):
             raise ValueError(f"{where}: {name} must be whole numbers")
         out[name] = numbers.astype(np.int64)
-    if (out["feature"] < 0).any() or (out["feature"] >= count).any():
-        raise ValueError(f"{where}: feature must count from 0 on, fewer than there are looks")
-    stop = out.get("stop")
-    moved = (np.diff(out["commanded"], axis=0) != 0).any(1) if stop is None else np.diff(stop) != 0
+    if (out["feature"] < 0).any():
+        raise ValueError(f"{where}: feature must be 0 or more")
+    if (out["feature"] >= max(count, _FEATURES)).any():
+        raise ValueError(f"{where}: feature must count from 0 on, up to the number of looks")
+    moved = (np.diff(out["commanded"], axis=0) != 0).any(1)
+    if "stop" in one:
+        moved = np.diff(out["stop"]) != 0
     out["stop"] = np.concatenate([[0], np.cumsum(moved)])
     out["found"], out["mask"] = found, np.ones(count, dtype=bool)
     return out
