@@ -183,7 +183,8 @@ def _advance(
             )
             # A reading's variance matters only as far as it is seen in the picture.
             visible = (metric.answer * metric.information.mT).sum(-1)
-            share = (visible * noise.head[:, None]).mean(1)
+            stops = (visible > 0).any(2).sum(1).clamp_min(1)  # its own, whoever is beside it
+            share = (visible * noise.head[:, None]).sum(1) / stops[:, None]
             change = ((wanted.head / noise.head).log().abs() * share).amax(1)
             change = torch.maximum(change, (wanted.pixel / noise.pixel).log().abs())
             noise = wanted.where(active, noise)

@@ -32,7 +32,9 @@ def start_of(problem: Problem, observations: Observations, known: Known) -> Tens
     """
     layout = problem.layout
     zooms, head, features = (part.clone() for part in layout.split(known.mean))
-    told = layout.split(known.information)[0][..., at.LOG_FOCAL] > 0
+    # What nothing is known of has a mean of 0, as if of a pixel.
+    told = layout.split(known.sigma)[0][..., at.LOG_FOCAL].isfinite()
+    told &= zooms[..., at.LOG_FOCAL] != 0
     measured = _focal_lengths(problem, observations)
     focal = torch.where(told, zooms[..., at.LOG_FOCAL].exp(), measured)
     focal = _filled(focal, observations)

@@ -36,9 +36,11 @@ class ZoomRecord(_Record):
     patterns: str | None = None  # file, relative to the camera's folder
     lines: int = Field(0, ge=0)
     points: int = Field(0, ge=0)
+    # px, largest displacement sigma when no more views were chosen; None: lines were scanned
+    sigma_px: float | None = Field(None, ge=0)
     error: str | None = None  # why there is nothing, or not all
 
-    @field_validator("magnification_sigma", "focal_length_sigma_px", mode="before")
+    @field_validator("magnification_sigma", "focal_length_sigma_px", "sigma_px", mode="before")
     @classmethod
     def _known(cls, value: object) -> object:
         """NaN and infinity are an estimate's way to say "not known"."""
@@ -73,6 +75,7 @@ class CameraRecord(_Record):
     feature: FeatureConfig | None = None
     head: HeadConfig = HeadConfig()
     zooms: list[ZoomRecord] = []
+    views_ended: str | None = None  # why no more views were chosen; None: lines were scanned
     error: str | None = None  # why the camera failed
     finished: bool = False  # False while collection runs, and where it was interrupted
 
