@@ -1,8 +1,9 @@
 """The main job on a simulated fleet, from nothing to checked tables and rectified pictures.
 
-Serves the cameras of configs/simulated_fleet.yaml in a process of their own, calibrates them over
-HTTP as configs/fleet.yaml says, compares every table with the simulator's truth, and rectifies a
-picture of each camera's checkerboard.
+Serves the cameras of configs/simulated_fleet.yaml in a process of their own, and beside them the
+same cameras with perfect bodies, calibrates all of them over HTTP as configs/fleet.yaml says,
+compares what was found with the simulator's truth, by the standard deviations that are stated with
+it, and rectifies a picture of each camera's checkerboard.
 """
 
 from __future__ import annotations
@@ -11,42 +12,37 @@ import argparse
 import json
 import os
 import shutil
-import statistics
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
-import numpy as np
 import yaml
+from demo_check import FleetFigures, fleet_figures
+from demo_tables import print_figures
 from rich.console import Console
-from rich.table import Table
-from simulated_pictures import draw_collected, photograph_board, undistortion
+from simulated_pictures import draw_collected, photograph_board
 
 import torchptz as tp
 from torchptz.cameras import CameraError
 from torchptz.files import without_nan, write_whole
 from torchptz.fleet.calibrate import calibrate
-from torchptz.fleet.config import CameraConfig, parse_config
+from torchptz.fleet.config import CameraConfig, FleetConfig, parse_config
+from torchptz.fleet.progress import Stages
 from torchptz.fleet.records import RECORD_NAME
-from torchptz.fleet.solve import TABLE_NAME, TABLE_NAME_WITHOUT, Summary, solve
+from torchptz.fleet.solve import TABLE_NAME, solve
+from torchptz.fleet.summary import Summary
 from torchptz.report.figures import draw_before_after, save_figure
-from torchptz.simulation import (
-    CameraTruth,
-    SimulationConfig,
-    SimulationError,
-    compare_lens,
-    load_truth,
-    serve_in_process,
-)
+from torchptz.simulation import SimulationConfig, SimulationError, load_truth, serve_in_process
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 PASSWORD_VARIABLE = "TORCHPTZ_DEMO_PASSWORD"
 MARK_NAME, CHECK_NAME = "demo.json", "truth_check.json"
-
-# What a head that stops at exact multiples of its quantum, and says so truly, must allow.
-MEDIAN_LIMIT_PX = 0.4
-WORST_LIMIT_PX = 0.8
+REALISTIC, PERFECT = "realistic", "perfect"
+PERFECT_CAMERAS = 2  # of the fleet, that have a twin with a perfect body: each takes its time
+QUICK_CAMERAS = 2
+SUFFIXES = {REALISTIC: "", PERFECT: "-perfect"}  # of the cameras' names
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -91,38 +87,66 @@ def make_folder(out: Path, quick: bool) -> Path:
 def run(out: Path, quick: bool, console: Console) -> int:
     """The demo; returns the exit code."""
     started = time.monotonic()
-    simulated = SimulationConfig.load(CONFIGS / "simulated_fleet.yaml")
-    fleet = yaml.safe_load((CONFIGS / "fleet.yaml").read_text(encoding="utf-8"))
-    if quick:
-        fleet["cameras"] = fleet["cameras"][:2]
-        fleet["defaults"]["zooms"] = [1, 12]
-        fleet["defaults"]["scan"] = {"horizontal": 7, "vertical": 6, "points_per_line": 12}
+    simulated = simulations(QUICK_CAMERAS if quick else None)
     # Beside the run and not in it: what is in the run, the estimator may read.
-    truth_path = out.with_name(f"{out.name}-truth.json")
-    with serve_in_process(simulated, truth_path) as addresses:
-        os.environ[PASSWORD_VARIABLE] = simulated.cameras[0].password
-        for camera in fleet["cameras"]:
-            camera["address"] = addresses[camera["name"]]
-        config = parse_config(fleet, str(CONFIGS / "fleet.yaml"))
-        say(
-            console,
-            f"{len(config.cameras)} simulated cameras answer; calibrating them over HTTP into",
-            out,
-        )
-        summary = calibrate(config, out, progress=Stages(console, started))
-        without = solve(out, offsets=False, cameras=list(summary.cameras))
-        truth = load_truth(truth_path)
-        passed = check(console, summary, without, truth, simulated, out)
+    truths = {name: out.with_name(f"{out.name}-truth-{name}.json") for name in simulated}
+    with ExitStack() as served:
+        addresses: dict[str, str] = {}
+        for name, fleet in simulated.items():
+            addresses |= served.enter_context(serve_in_process(fleet, truths[name]))
+        config = fleet_config(addresses, quick)
+        os.environ[PASSWORD_VARIABLE] = simulated[REALISTIC].cameras[0].password
+        say(console, f"{len(config.cameras)} simulated cameras answer; calibrating them into", out)
+        summary = calibrate(config, out, progress=Stages(lambda line: say(console, line)))
+        solve(out, head=False, cameras=list(summary.cameras))
+        figures = {}
+        for name, fleet in simulated.items():
+            results = {one.name: summary.cameras[one.name] for one in fleet.cameras}
+            truth = load_truth(truths[name])
+            figures[name] = fleet_figures(results, truth, out, SUFFIXES[name])
+        passed = check(console, figures, out)
         say(console, "tables:", *(out / one.table for one in summary.cameras.values() if one.table))
+        shown = {one.name for one in simulated[REALISTIC].cameras}
         pictures = [
             picture
             for camera in config.cameras
-            for picture in draw(console, camera, simulated, out / camera.name)
+            if camera.name in shown
+            for picture in draw(console, camera, simulated[REALISTIC], out / camera.name)
         ]
     say(console, "pictures:", *pictures)
-    say(console, f"truth, which no estimator has seen: {truth_path}")
+    say(console, "truth, which no estimator has seen:", *truths.values())
+    tell_failures(console, summary)
     console.print(f"took {time.monotonic() - started:.0f} s")
     return 0 if passed and summary.all_ok else 1
+
+
+def simulations(count: int | None) -> dict[str, SimulationConfig]:
+    """The first cameras of the simulated fleet as they are, and with perfect bodies."""
+    fleet = SimulationConfig.load(CONFIGS / "simulated_fleet.yaml")
+    fleet = fleet.model_copy(update={"cameras": fleet.cameras[:count]})
+    twins = [
+        camera.model_copy(update={"name": camera.name + SUFFIXES[PERFECT]})
+        for camera in fleet.with_perfect_bodies().cameras[:PERFECT_CAMERAS]
+    ]
+    return {REALISTIC: fleet, PERFECT: fleet.model_copy(update={"cameras": twins})}
+
+
+def fleet_config(addresses: dict[str, str], quick: bool) -> FleetConfig:
+    """Both fleets as one, each camera as configs/fleet.yaml has it.
+
+    addresses: by name, of the cameras that are there.
+    """
+    fleet = yaml.safe_load((CONFIGS / "fleet.yaml").read_text(encoding="utf-8"))
+    if quick:
+        fleet["defaults"]["zooms"] = [1, 12]
+        fleet["defaults"]["scan"] = {"horizontal": 7, "vertical": 6, "points_per_line": 12}
+    fleet["cameras"] = [
+        {**camera, "name": name, "address": addresses[name]}
+        for suffix in SUFFIXES.values()
+        for camera in fleet["cameras"]
+        if (name := camera["name"] + suffix) in addresses
+    ]
+    return parse_config(fleet, str(CONFIGS / "fleet.yaml"))
 
 
 def say(console: Console, text: str, *paths: Path) -> None:
@@ -131,18 +155,40 @@ def say(console: Console, text: str, *paths: Path) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-class Stages:
-    """Prints a line whenever a camera begins something new."""
+def check(console: Console, figures: dict[str, FleetFigures], out: Path) -> bool:
+    """Print and store how far everything is from the truth; whether as near as it claims."""
+    print_figures(console, figures)
+    failures = {name: fleet.failures() for name, fleet in figures.items()}
+    failures[PERFECT] += figures[PERFECT].failures_of_perfect()
+    for name, fleet in figures.items():
+        (median, worst), (median_lines, worst_lines) = fleet.similarity(), fleet.similarity(True)
+        say(
+            console,
+            f"truth check of {name} bodies {'FAILED' if failures[name] else 'passed'}: after a "
+            f"similarity median {median:.2f} px, worst {worst:.2f} px; lines only "
+            f"{median_lines:.2f} px and {worst_lines:.2f} px",
+        )
+        for reason in failures[name]:
+            say(console, f"  {reason}")
+    found = {
+        "passed": not any(failures.values()),
+        "fleets": {
+            name: {"failures": failures[name], **fleet.as_dict()} for name, fleet in figures.items()
+        },
+    }
+    write_whole(out / CHECK_NAME, json.dumps(without_nan(found), indent=2, allow_nan=False) + "\n")
+    return found["passed"]
 
-    def __init__(self, console: Console, started: float) -> None:
-        self._console = console
-        self._started = started
-        self._last: dict[str, str] = {}
 
-    def __call__(self, camera: str, what: str, done: int, total: int) -> None:
-        if self._last.get(camera) != what:
-            self._last[camera] = what
-            say(self._console, f"{time.monotonic() - self._started:6.1f} s  {camera}: {what}")
+def tell_failures(console: Console, summary: Summary) -> None:
+    """What went wrong with any camera, in a line each."""
+    for name, camera in summary.cameras.items():
+        for where, error in [
+            (name, camera.error),
+            *((f"{name} {zoom.magnification:.4g}x", zoom.error) for zoom in camera.zooms),
+        ]:
+            if error is not None:
+                say(console, f"{where}: {error}")
 
 
 def draw(
@@ -170,105 +216,6 @@ def draw(
     paths.append(folder / "board_before_after.png")
     save_figure(draw_before_after(before, after), paths[-1])
     return paths
-
-
-def check(
-    console: Console,
-    summary: Summary,
-    without: Summary,
-    truth: dict[str, CameraTruth],
-    simulated: SimulationConfig,
-    out: Path,
-) -> bool:
-    """Print and store how far every table is from the truth; whether it is near enough."""
-    rows = []
-    for name, camera in summary.cameras.items():
-        tables = {
-            key: tp.ZoomTable.load(path) if (path := out / name / file).exists() else None
-            for key, file in (("offsets", TABLE_NAME), ("no_offsets", TABLE_NAME_WITHOUT))
-        }
-        head = next(one for one in simulated.cameras if one.name == name).head
-        quantum = np.deg2rad(1 / min(head.pan_units_per_deg, head.tilt_units_per_deg))
-        for zoom, other in zip(camera.zooms, without.cameras[name].zooms, strict=True):
-            row = {
-                "camera": name,
-                "zoom": zoom.magnification,
-                "status": zoom.status or "FAILED",
-                "status_no_offsets": other.status or "FAILED",
-                "quantum_px": float(truth[name].focal_length(zoom.zoom_units) * quantum),
-            }
-            for key, table in tables.items():
-                errors = compare(table, truth[name], zoom.zoom_units)
-                row[f"similarity_{key}_px"], row[f"homography_{key}_px"] = errors
-            rows.append(row)
-    print_rows(console, rows)
-    errors = [row["similarity_offsets_px"] for row in rows]
-    if not errors:
-        console.print("truth check FAILED: no zoom of any camera was collected")
-        return False
-    others = [row["similarity_no_offsets_px"] for row in rows]
-    median, worst = statistics.median(errors), max(errors)
-    median_without, worst_without = statistics.median(others), max(others)
-    passed = median <= MEDIAN_LIMIT_PX and worst <= WORST_LIMIT_PX
-    say(
-        console,
-        f"truth check {'passed' if passed else 'FAILED'}: median {median:.2f} px (limit "
-        f"{MEDIAN_LIMIT_PX}), worst {worst:.2f} px (limit {WORST_LIMIT_PX}); without offsets "
-        f"median {median_without:.2f} px, worst {worst_without:.2f} px",
-    )
-    good = sum(row["status_no_offsets"] == "OK" for row in rows)
-    say(
-        console,
-        f"Without offsets {good} of {len(rows)} have status ok, which is no promise of 1 or 2 px: "
-        "the head's quantum is no white noise. It bends whole lines, and a fit that takes it for "
-        "noise cannot tell.",
-    )
-    found = {
-        "passed": passed,
-        "median_px": median,
-        "worst_px": worst,
-        "median_no_offsets_px": median_without,
-        "worst_no_offsets_px": worst_without,
-        "rows": rows,
-    }
-    write_whole(out / CHECK_NAME, json.dumps(without_nan(found), indent=2, allow_nan=False) + "\n")
-    return passed
-
-
-def print_rows(console: Console, rows: list[dict]) -> None:
-    """One row a camera and zoom."""
-    report = Table(
-        title="Largest error over the image, px, after best alignment", title_justify="left"
-    )
-    columns = {
-        "camera": lambda row: row["camera"],
-        "zoom": lambda row: f"{row['zoom']:.3f}",
-        "quantum px": lambda row: f"{row['quantum_px']:.1f}",
-        "similarity": lambda row: f"{row['similarity_offsets_px']:.2f}",
-        "homography": lambda row: f"{row['homography_offsets_px']:.2f}",
-        "status": lambda row: row["status"].lower().replace("_", " "),
-        "similarity, no offsets": lambda row: f"{row['similarity_no_offsets_px']:.2f}",
-        "homography, no offsets": lambda row: f"{row['homography_no_offsets_px']:.2f}",
-        "status, no offsets": lambda row: row["status_no_offsets"].lower().replace("_", " "),
-    }
-    for heading in columns:
-        left = heading == "camera" or heading.startswith("status")
-        report.add_column(heading, justify="left" if left else "right")
-    for row in rows:
-        report.add_row(*(text(row) for text in columns.values()))
-    console.print(report)
-
-
-def compare(
-    table: tp.ZoomTable | None, truth: CameraTruth, zoom_units: float
-) -> tuple[float, float]:
-    """Largest error after a similarity and after a homography; inf where there is no lens."""
-    knots = () if table is None else table.knots
-    lens = next((knot.lens for knot in knots if knot.zoom_units == zoom_units), None)
-    if lens is None:
-        return float("inf"), float("inf")
-    comparison = compare_lens(truth, undistortion(lens), zoom_units)
-    return comparison.similarity_px, comparison.homography_px
 
 
 if __name__ == "__main__":

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 
 from torchptz.cameras import CameraError, Pose, open_camera
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.journal import JOURNAL_NAME, read_journal
 from torchptz.fleet.records import CameraRecord
-from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 from torchptz.report.figures import draw_pattern
 from torchptz.scanning.observation import Observer
@@ -72,33 +69,33 @@ def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.nd
 
 
 def draw_collected(folder: Path, zoom_index: int = 0) -> Figure | None:
-    """The zoom tracks of a camera and its lines at one zoom.
+    """The zoom tracks of a camera, and its lines and other poses at one zoom.
 
     Args:
         folder: the camera's, in a run.
         zoom_index: of the record's zooms.
 
     Returns:
-        Figure; None where there is no principal point or no line yet.
+        Figure; None where there is no principal point or nothing at that zoom yet.
     """
     record = CameraRecord.load(folder)
     if record.principal_point is None or len(record.zooms) <= zoom_index:
         return None
-    zoom = record.zooms[zoom_index]
-    if zoom.patterns is None:
-        return None
+    patterns = record.zooms[zoom_index].patterns
+    lines = [] if patterns is None else LinePatterns.load(folder / patterns).to_lists()[0]
     tracks: dict[int, list[tuple[float, float]]] = {}
+    views: list[tuple[float, float]] = []
     for seen in read_journal(folder / JOURNAL_NAME):
         if seen.purpose == "track" and seen.found:
             tracks.setdefault(seen.group, []).append(seen.pixel)
+        if seen.purpose == "view" and seen.zoom_index == zoom_index and seen.found:
+            views.append(seen.pixel)
+    if not (lines or views):
+        return None
     return draw_pattern(
         [np.array(track) for track in tracks.values()],
         record.principal_point,
-        LinePatterns.load(folder / zoom.patterns).to_lists()[0],
+        lines,
         record.image_size,
+        np.array(views) if views else None,
     )
-
-
-def undistortion(lens: RadialLens) -> Callable[[np.ndarray], np.ndarray]:
-    """A lens (batch of one) as a function of points (N, 2) px, as `compare_lens` wants it."""
-    return lambda points: lens.undistort(torch.from_numpy(points)[None])[0].numpy()

@@ -96,6 +96,15 @@ class TestPattern:
         assert "3 zoom tracks" in titles[0]
         assert "60 points on 4 lines" in titles[1]
 
+    def test_poses_of_their_own_stand_beside_the_lines(self):
+        views = np.array([[40.0, 60.0], [200, 30], [300, 220]])
+        both = draw_pattern(tracks(), CENTER, lines(), SIZE, views)
+        assert "60 points on 4 lines and 3 more" in both.axes[1].get_title()
+        assert count(both, ORANGE) > 20
+        alone = draw_pattern(tracks(), CENTER, [], SIZE, views).axes[1]
+        assert alone.get_title().endswith(": 3 points")
+        assert [len(line.get_xydata()) for line in alone.lines] == [3]
+
     def test_y_points_down_and_the_picture_is_shown_whole(self):
         for axes in draw_pattern(tracks(), CENTER, lines(), SIZE).axes:
             assert axes.get_xlim() == (-0.5, 319.5)

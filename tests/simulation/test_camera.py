@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
 from torchptz.simulation.view import HeadPose
 
@@ -87,12 +88,32 @@ class TestBall:
         assert not np.any((met != drawn) & (edge == 0))
 
     def test_area_grows_with_the_focal_length(self, make_camera):
-        camera = make_camera(scene={"ball": {**BALL, "limb_darkening": 0}})
+        scene = {"ball": {**BALL, "limb_darkening": 0}, "plain_background": 40}
+        camera = make_camera(scene=scene)
+        half = (40 + camera.config.scene.ball.brightness) / 2
         for magnification in (3, 12):
             pose = pose_with_ball_at(camera, (368, 272), magnification)
             radius = camera.view(pose).lens.focal_length * 0.036 / 12
-            area = (camera.render(pose)[..., 1] > 185).sum()
-            assert area == pytest.approx(np.pi * radius**2, rel=0.1)
+            area = (camera.render(pose)[..., 1] > half).sum()
+            assert area == pytest.approx(np.pi * radius**2, rel=0.05)
+
+    def test_edge_is_blurred_before_pixels_integrate_it(self, make_camera):
+        """Along a row through the middle the outline is a straight edge: a normal distribution
+        function of the lens's blur, meant over each pixel."""
+        scene = {"ball": {**BALL, "limb_darkening": 0}, "plain_background": 40}
+        camera = make_camera(scene=scene, psf_px=0.5)
+        within = (np.arange(100) + 0.5) / 100 - 0.5
+        for shift in (0.0, 0.2, 0.4, 0.6, 0.8):
+            pose = pose_with_ball_at(camera, (368 + shift, 272), 20)
+            left = camera.ball_pixel(pose) - (camera.view(pose).lens.focal_length * 0.036 / 12, 0)
+            y, x = round(left[1]), np.arange(round(left[0]) - 4, round(left[0]) + 5)
+            seen = camera.render(pose)[y, x, 1].astype(float)
+            dark, bright = camera.render(pose)[y, [x[0], x[-1]], 1].astype(float)
+            share = (seen - dark) / (bright - dark)
+            # where the edge is may be off a little, its form not
+            places = left[0] + np.linspace(-0.4, 0.4, 81)
+            forms = norm.cdf((x[:, None] + within)[None] - places[:, None, None], scale=0.5)
+            assert np.abs(forms.mean(2) - share).max(1).min() < 0.02
 
     def test_is_the_brightest_thing(self, make_camera):
         camera = make_camera(scene={"ball": BALL, "highlights": None}, noise_dn=2)

@@ -1,8 +1,10 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from torchptz.simulation import SimulationConfig, SimulationError
+from torchptz.simulation.config import OF_THE_BODY
 
 SHIPPED = Path(__file__).parents[2] / "configs" / "simulated_fleet.yaml"
 
@@ -19,6 +21,22 @@ class TestShippedFleet:
             assert abs(ball.pan_deg) + 27 < 170
             assert ball.tilt_deg - 20 >= -25
             assert ball.tilt_deg + 20 <= 90
+
+    def test_no_body_is_perfect(self):
+        for camera in SimulationConfig.load(SHIPPED).cameras:
+            for name in OF_THE_BODY:
+                assert np.all(getattr(camera.head, name)), f"{camera.name}: {name}"
+
+
+class TestPerfectBodies:
+    def test_differ_in_nothing_but_the_body(self):
+        config = SimulationConfig.load(SHIPPED)
+        for camera, twin in zip(config.cameras, config.with_perfect_bodies().cameras, strict=True):
+            for name in OF_THE_BODY:
+                assert not np.any(getattr(twin.head, name)), name
+            head = camera.head.model_dump(exclude=set(OF_THE_BODY))
+            assert twin.head.model_dump(exclude=set(OF_THE_BODY)) == head
+            assert twin.model_dump(exclude={"head"}) == camera.model_dump(exclude={"head"})
 
 
 class TestErrors:

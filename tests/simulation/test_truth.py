@@ -2,15 +2,23 @@ import json
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from torchptz.simulation import SimulatedFleet, SimulationError, load_truth
+from torchptz.simulation import CameraTruth, SimulatedFleet, SimulationError, load_truth
 
 CONFIG = {
     "cameras": [
         {
             "name": "a",
             "seed": 21,
-            "head": {"pixel_aspect": 0.985, "roll_deg": 1.5, "principal_point_drift_px": (2, 1)},
+            "head": {
+                "pixel_aspect": 0.985,
+                "roll_deg": 1.5,
+                "boresight_deg": (3.0, -4.0),
+                "tilt_zero_deg": 0.7,
+                "reading_jitter": 0.3,
+                "principal_point_drift_px": (2, 1),
+            },
         },
         {"name": "b", "seed": 22},
     ]
@@ -53,6 +61,11 @@ class TestFile:
             back = row["centre_px"] + q * (1 + a * rho + b * rho**2 + c * rho**3) * (1, 0.985)
             np.testing.assert_allclose(back, POINTS, atol=1e-8)
 
+    def test_has_the_head_in_the_fewest_angles(self, path):
+        data, truth = json.loads(path.read_text())["cameras"][0], load_truth(path)["a"]
+        assert tuple(data["head_angles_deg"].values()) == truth.head_angles_deg()
+        assert tuple(data["reading_sigma_deg"]) == truth.reading_sigma_deg()
+
     def test_default_table_spans_the_zoom(self, fleet, tmp_path):
         fleet.write_truth(tmp_path / "t.json")
         table = json.loads((tmp_path / "t.json").read_text())["cameras"][1]["table"]
@@ -92,3 +105,29 @@ class TestValues:
     def test_distort_inverts(self, path):
         truth = load_truth(path)["b"]
         np.testing.assert_allclose(truth.distort(0, truth.undistort(0, POINTS)), POINTS, atol=1e-9)
+
+
+class TestHead:
+    def test_three_angles_turn_as_the_four_do(self, fleet, path):
+        tilt_zero, boresight, roll = load_truth(path)["a"].head_angles_deg()
+        for pan, tilt in ((0.0, 0.0), (30.0, -20.0), (-140.0, 75.0)):
+            pose = fleet.cameras["a"].true_pose(np.deg2rad(pan), np.deg2rad(tilt), 0)
+            turns = (("z", roll), ("y", boresight), ("x", tilt + tilt_zero), ("y", pan))
+            matrices = [Rotation.from_euler(axis, a, degrees=True).as_matrix() for axis, a in turns]
+            expected = np.linalg.multi_dot(matrices)
+            rotation = fleet.cameras["a"].view(pose).rotation
+            np.testing.assert_allclose(rotation, expected, atol=1e-12)
+
+    def test_without_a_boresight_they_are_the_heads_own(self):
+        truth = CameraTruth.of(
+            SimulatedFleet(
+                {"cameras": [{"name": "c", "head": {"tilt_zero_deg": 0.2, "roll_deg": -1.0}}]}
+            ).cameras["c"]
+        )
+        np.testing.assert_allclose(truth.head_angles_deg(), (0.2, 0.0, -1.0), atol=1e-12)
+
+    def test_readings_err_uniformly_over_the_jitter(self, path):
+        pan, tilt = load_truth(path)["a"].reading_sigma_deg()
+        assert pan == pytest.approx(0.3 / 14.4 / np.sqrt(12))
+        assert tilt == pytest.approx(0.3 * 115 / 1800 / np.sqrt(12))
+        assert load_truth(path)["b"].reading_sigma_deg() == (0, 0)

@@ -49,6 +49,7 @@ def draw_pattern(
     principal_point: Sequence[float],
     lines: Sequence[np.ndarray],
     image_size: tuple[int, int],
+    views: np.ndarray | None = None,
 ) -> Figure:
     """Both virtual patterns: zoom tracks with the principal point, and the distortion pattern.
 
@@ -57,6 +58,7 @@ def draw_pattern(
         principal_point: (2,) px, where the tracks meet.
         lines: L arrays (n, 2) px as seen; the line fitted to each is drawn with it.
         image_size: (width, height) px.
+        views: (V, 2) px as seen, on no line: poses that were chosen one by one.
 
     Source: paper, figure 1.
     """
@@ -81,16 +83,23 @@ def draw_pattern(
     left.set_title(f"(a) Principal point pattern: {len(tracks)} zoom tracks")
     for line in map(as_points, lines):
         right.plot(*segment(line, line).T, color=GREY, lw=0.8)
-    points = np.concatenate([as_points(line) for line in lines])
-    right.plot(*points.T, "o", color=BLUE, ms=2.6, mew=0)
-    legend_below(
-        right,
-        [
-            Line2D([], [], ls="", marker="o", color=BLUE, ms=4, label="feature at one pose"),
-            Line2D([], [], color=GREY, label="line fitted to its points"),
-        ],
-    )
-    right.set_title(f"(b) Distortion pattern: {len(points)} points on {len(lines)} lines")
+    points = np.concatenate([np.empty((0, 2)), *map(as_points, lines)])
+    alone = np.empty((0, 2)) if views is None else as_points(views)
+    handles = []
+    for places, marker, color, size, label in (
+        (points, "o", BLUE, 2.6, "feature at one pose" + (" of a line" if len(alone) else "")),
+        (alone, "D", ORANGE, 3.2, "feature at a pose of its own"),
+    ):
+        if len(places):
+            right.plot(*places.T, marker, color=color, ms=size, mew=0)
+            handles.append(Line2D([], [], ls="", marker=marker, color=color, ms=4, label=label))
+    title = f"{len(points)} points on {len(lines)} lines"
+    if len(lines):
+        handles.append(Line2D([], [], color=GREY, label="line fitted to its points"))
+    if len(alone):
+        title = f"{title} and {len(alone)} more" if len(lines) else f"{len(alone)} points"
+    legend_below(right, handles)
+    right.set_title(f"(b) Distortion pattern: {title}")
     for axes in (left, right):
         picture_axes(axes, image_size)
     return figure

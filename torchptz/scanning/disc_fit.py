@@ -10,6 +10,7 @@ import numpy as np
 _SIGMA_FLOOR = 0.003  # px: what quantised grey values and sampling leave in a perfect picture
 # Measured on rendered balls (radius 2 to 80 px, noise 0 to 5 DN, JPEG 75 and better, textures):
 _SHADING_SIGMA = 0.024  # px times the radius in px: light from the side, beyond the shading prior
+_EDGE_FLOOR = 0.005  # px, at any radius: light from the side, beyond what the harmonics show
 _EDGE_INFLATION = 1.45  # directed light adds more to the first harmonic than to its neighbours
 _SOFTNESS = 0.6  # px: an in-focus edge, PSF of 0.5 px and the pixel's own 0.29 px together
 
@@ -131,34 +132,58 @@ def fit_pixels(
     )
 
 
+def _sample(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _draw_disc(
+    center: tuple[float, float], size: float, k1: float, k2: float, blur: float
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """A disc of 0 and 1 in pixels, (n, n) float32, and the (x, y) of its first pixel.
+
+    center px; size, k1, k2 as in `fit_edge`: radius size / sqrt(1 + k1 cos 2a + k2 sin 2a) in the
+    direction a; blur: sigma of its edge in px, the pixel's own extent included.
+    """
+    reach = size / np.sqrt(1.0 - min(np.hypot(k1, k2), 0.9)) + 4.0 * blur + 3.0
+    x0, y0 = (int(np.floor(v - reach)) for v in center)
+    span = np.arange(int(np.ceil(2.0 * reach)) + 2)
+    x = (span + (x0 - center[0])).astype(np.float32)
+    y = (span + (y0 - center[1])).astype(np.float32)[:, None]
+    x2, y2 = x * x, y * y
+    square = x2 + y2 + np.float32(1e-12)
+    # Python floats keep float32; NumPy's scalars would not
+    rim = float(size) / np.sqrt(1.0 + (float(k1) * (x2 - y2) + float(2.0 * k2) * x * y) / square)
+    return _edge(np.clip((rim - np.sqrt(square)) / float(blur), -6.0, 6.0)), (x0, y0)
+
+
 def fit_edge(
     gray: np.ndarray, center: np.ndarray, radius: float, *, iterations: int = 8
 ) -> DiscFit:
     """Fit an ellipse robustly to edge points found on rays, each with its own grey levels.
 
     gray (H, W) uint8; center (2,) and radius: first guess in px, good to about 2 px. Right for
-    large balls: neither the shading nor the texture behind the ball has to be modelled. Raises
-    numpy.linalg.LinAlgError where there is no edge.
+    large balls: neither the shading nor the texture behind the ball has to be modelled. An edge
+    in focus is too sharp to be interpolated exactly, by an amount that depends on its place within
+    the pixel; so the same rays go through a disc drawn where the fit stands, and an edge point is
+    what the picture gives less what the drawing gives. Raises numpy.linalg.LinAlgError where there
+    is no edge or the fit runs away from its first guess.
     """
     count = int(np.clip(round(2 * np.pi * radius), 32, 320))
     angle = np.arange(count) * (2 * np.pi / count)
     cosine, sine = np.cos(angle), np.sin(angle)
     cos2, sin2 = np.cos(2 * angle), np.sin(2 * angle)
     cx, cy = np.asarray(center, dtype=np.float64)
-    size, k1, k2, soft = float(radius), 0.0, 0.0, _SOFTNESS
+    size, k1, k2 = float(radius), 0.0, 0.0
+    soft = blur = _SOFTNESS  # px, sigma of the edge: as interpolated, and in the pixels themselves
     for iteration in range(iterations):
         half = max(4.0, 5.0 * soft, 0.0 if iteration else 0.15 * size)
         half = min(half, 0.7 * size)
         t = np.linspace(-half, half, 2 * int(np.ceil(2 * half)) + 1)
         rim = size / np.sqrt(1 + k1 * cos2 + k2 * sin2)
         reach = rim[:, None] + t
-        profile = cv2.remap(
-            gray,
-            (cx + reach * cosine[:, None]).astype(np.float32),
-            (cy + reach * sine[:, None]).astype(np.float32),
-            cv2.INTER_CUBIC,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).astype(np.float64)
+        x = (cx + reach * cosine[:, None]).astype(np.float32)
+        y = (cy + reach * sine[:, None]).astype(np.float32)
+        profile = _sample(gray, x, y).astype(np.float64)
         inner, bell = _edge(-t / soft), _bell(t / soft) / soft
         basis = np.stack(
             [
@@ -172,15 +197,20 @@ def fit_edge(
             ],
             axis=1,
         )
-        level = profile @ np.linalg.pinv(basis).T  # (rays, 6)
+        inverse = np.linalg.pinv(basis).T
+        level = profile @ inverse  # (rays, 7)
         contrast = np.maximum(level[:, 1] + 0.3 * level[:, 4] - level[:, 0], 1.0)
-        edge = np.clip(level[:, 5] / contrast, -half, half)
+        shift = level[:, 5:] / contrast[:, None]  # px, of the edge's place and of its blur
+        wider = np.clip(shift[:, 1], -0.5, 1.0)
         if iteration == 0:  # the guess may be off by more than the linear range of `bell`
             quarter = t.size // 4
             ends = profile[:, :quarter].mean(axis=1) - profile[:, -quarter:].mean(axis=1)
             contrast = np.maximum(ends, 1.0)
             edge = 0.5 * (t[2:] + t[:-2])[np.argmax(profile[:, :-2] - profile[:, 2:], axis=1)]
-        wider = np.clip(level[:, 6] / contrast, -0.5, 1.0)
+        else:
+            disc, (x0, y0) = _draw_disc((cx, cy), size, k1, k2, blur)
+            shift -= _sample(disc, x - np.float32(x0), y - np.float32(y0)) @ inverse[:, 5:]
+            edge = np.clip(shift[:, 0], -half, half)
         usable = contrast > 20.0
         design = np.stack(
             [cosine, sine, rim / size, *(-(rim**3) / (2 * size**2) * c for c in (cos2, sin2))], 1
@@ -194,13 +224,14 @@ def fit_edge(
             scale = 1.4826 * np.median(np.abs(residual)) + (0.02 if iteration else 0.5)
             weight = base * np.clip(1 - (residual / (4.0 * scale)) ** 2, 0, None) ** 2
         cx, cy, size = cx + step[0], cy + step[1], max(size + step[2], 2.0)
+        if not np.hypot(cx - center[0], cy - center[1]) + size < 3.0 * radius + 10.0:
+            raise np.linalg.LinAlgError("the fit ran away from its first guess")
         k1, k2 = (float(np.clip(k + d, -0.6, 0.6)) for k, d in zip((k1, k2), step[3:], strict=True))
         settled = np.abs(step).max() < 0.01
-        soft = float(
-            np.clip(
-                soft + np.median(wider[usable]) if iteration and usable.any() else soft, 0.35, 6.0
-            )
-        )
+        if iteration and usable.any():
+            soft = float(np.clip(soft + np.median(wider[usable]), 0.35, 6.0))
+            more = np.clip(np.median(shift[usable, 1]), -0.5, 1.0)
+            blur = float(np.clip(blur + more, 0.3, 6.0))
         if settled and iteration > 1:
             break
     k = min(np.hypot(k1, k2), 0.9)
@@ -211,7 +242,7 @@ def fit_edge(
     sigma = np.sqrt(2.0 * np.mean(spectrum**2)) / count
     return DiscFit(
         center=np.array([cx, cy]),
-        sigma=float(np.hypot(_EDGE_INFLATION * sigma, _SIGMA_FLOOR)),
+        sigma=float(np.hypot(_EDGE_INFLATION * sigma, _EDGE_FLOOR)),
         radius=float(size / (1 - k * k) ** 0.25),
         axis_ratio=float(np.sqrt((1 + k) / (1 - k))),
         softness=soft,

@@ -111,6 +111,17 @@ class HeadConfig(_Section):
     principal_point_drift_px: Pair = (0.0, 0.0)  # from the widest to the longest zoom
 
 
+# Of a head's imperfections those of its mechanics; the others are of lens and sensor.
+OF_THE_BODY = (
+    "boresight_deg",
+    "tilt_zero_deg",
+    "roll_deg",
+    "entrance_pupil_m",
+    "reading_jitter",
+    "backlash_deg",
+)
+
+
 class FaultConfig(_Section):
     """What goes wrong on the wire or in the head; each may also be switched at run time."""
 
@@ -154,6 +165,21 @@ class SimulationConfig(_Section):
             if twice:
                 raise ValueError(f"{what} given to more than one camera: {twice}")
         return self
+
+    def with_perfect_bodies(self) -> SimulationConfig:
+        """The same cameras, lenses and scenes with heads and mounts that are what they say.
+
+        The readings' quantum stays: it is no imperfection but how the head speaks.
+        """
+        perfect = {name: HeadConfig.model_fields[name].default for name in OF_THE_BODY}
+        return self.model_copy(
+            update={
+                "cameras": [
+                    camera.model_copy(update={"head": camera.head.model_copy(update=perfect)})
+                    for camera in self.cameras
+                ]
+            }
+        )
 
     @classmethod
     def load(cls, source: SimulationConfig | dict | str | Path) -> SimulationConfig:

@@ -41,7 +41,9 @@ def refine(
 
 
 def blur(image: np.ndarray, sigma: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (7, 7), sigma) if sigma > 0 else image
+    """By a Gaussian of `sigma` samples, to 4 sigma."""
+    side = 2 * int(np.ceil(4 * sigma)) + 1
+    return cv2.GaussianBlur(image, (side, side), sigma) if sigma > 0 else image
 
 
 def blend(

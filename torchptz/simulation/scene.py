@@ -75,8 +75,10 @@ class Spot:
         if self.side_light:
             shade -= self.side_light * np.clip(v, -1, 1)
         x0, y0, x1, y1 = region
+        # The lens blurs before the pixels integrate. The other way round edges would be
+        # undersampled as no real one is.
         cover, shade = (
-            blur(cv2.resize(m, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA), psf_px)
+            cv2.resize(blur(m, psf_px * fine), (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
             for m in (cover, cover * shade)
         )
         shade /= np.maximum(cover, 1e-6)

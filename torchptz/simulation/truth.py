@@ -12,6 +12,7 @@ import numpy as np
 from .camera import SimulatedCamera
 from .config import HeadConfig, SimulationError
 from .optics import OPTICAL_UNITS, Optics
+from .view import Mount, head_rotation
 
 SCHEMA, VERSION = "torchptz.truth", 1
 IMPERFECTIONS = (
@@ -24,6 +25,7 @@ IMPERFECTIONS = (
     "backlash_deg",
     "principal_point_drift_px",
 )
+_KEPT = (*IMPERFECTIONS, "pan_units_per_deg", "tilt_units_per_deg")
 TABLE_MAGNIFICATIONS = (1, 1.5, 2, 3, 5, 8, 12, 18, 25)
 
 
@@ -34,12 +36,12 @@ class CameraTruth:
     name: str
     seed: int
     optics: Optics
-    head: dict  # imperfections by their names in the configuration
+    head: dict  # imperfections and quanta by their names in the configuration
     ball: dict  # pan_deg, tilt_deg, distance_m, radius_m
 
     @classmethod
     def of(cls, camera: SimulatedCamera) -> CameraTruth:
-        head = camera.config.head.model_dump(include=set(IMPERFECTIONS))
+        head = camera.config.head.model_dump(include=set(_KEPT))
         ball = camera.config.scene.ball.model_dump(
             include={"pan_deg", "tilt_deg", "distance_m", "radius_m"}
         )
@@ -78,6 +80,29 @@ class CameraTruth:
         """(2,) px: the distortion's centre."""
         return np.array(self.optics.at(zoom_units).centre)
 
+    def head_angles_deg(self) -> tuple[float, float, float]:
+        """Tilt zero, boresight and roll (degrees) of a head whose picture is seen at
+        `Rz(roll) Ry(boresight) Rx(tilt + tilt zero) Ry(pan)`.
+
+        Boresight down, left, roll and the tilt's own zero are four turns one after the other, and
+        any turn is three about the axes: so this is the same head, exactly, in the fewest angles.
+        """
+        left, down = np.deg2rad(self.head["boresight_deg"])
+        mount = Mount((left, down), np.deg2rad(self.head["roll_deg"]))
+        turn = mount.rotation() @ head_rotation(0.0, np.deg2rad(self.head["tilt_zero_deg"]))
+        angles = (
+            np.arctan2(turn[2, 1], turn[2, 2]),
+            np.arcsin(-turn[2, 0]),
+            np.arctan2(turn[1, 0], turn[0, 0]),
+        )
+        return tuple(float(np.rad2deg(angle)) for angle in angles)
+
+    def reading_sigma_deg(self) -> tuple[float, float]:
+        """Standard deviation of the true stop about the reading, of pan and tilt, degrees."""
+        quanta = self.head["reading_jitter"] / np.sqrt(12)
+        units = self.head["pan_units_per_deg"], self.head["tilt_units_per_deg"]
+        return tuple(float(quanta / one) for one in units)
+
     def to_json(self, zoom_units: Sequence[float] | None = None) -> dict:
         """Parameters, and for readers without this package the values at the zooms asked for."""
         if zoom_units is None:
@@ -106,6 +131,10 @@ class CameraTruth:
             "optical_zoom_units": OPTICAL_UNITS,
             "optics": asdict(self.optics),
             "head": self.head,
+            "head_angles_deg": dict(
+                zip(("tilt_zero", "boresight", "roll"), self.head_angles_deg(), strict=True)
+            ),
+            "reading_sigma_deg": list(self.reading_sigma_deg()),
             "ball": self.ball,
             "table": table,
         }
@@ -116,7 +145,7 @@ class CameraTruth:
         missing = {f.name for f in fields(Optics)} ^ set(optics)
         if missing:
             raise ValueError(f"optics has too few or too many keys: {sorted(missing)}")
-        head = HeadConfig.model_validate(data["head"]).model_dump(include=set(IMPERFECTIONS))
+        head = HeadConfig.model_validate(data["head"]).model_dump(include=set(_KEPT))
         return cls(data["name"], data["seed"], Optics(**optics), head, dict(data["ball"]))
 
 
