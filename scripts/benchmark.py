@@ -1,7 +1,8 @@
 """What the project promises in figures, measured: numbers and time, which no test is for.
 
-`benchmark.py accuracy --json FILE` measures how accurate the estimator is, section by section (the
-modules of `accuracy`). The exit code is 0 only if every check holds: 1 if one does not or a section
+`benchmark.py accuracy --json FILE` measures how accurate the estimator is, `benchmark.py head` what
+the complete calibration makes of imperfect heads, each section by section (the modules of
+`accuracy` and `head`). The exit code is 0 only if every check holds: 1 if one does not or a section
 failed, 2 if the command was called wrongly, 130 if it was interrupted. What was measured until then
 is in the file.
 """
@@ -16,6 +17,7 @@ import platform
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,10 +28,13 @@ import torch
 
 from torchptz.files import without_nan, write_whole
 
-SECTIONS = (
-    *("paper_experiment", "lensfun", "real_sets", "catalogue", "offsets", "outliers"),
-    "convergence",
-)
+SECTIONS = {
+    "accuracy": (
+        *("paper_experiment", "lensfun", "real_sets", "catalogue", "offsets", "outliers"),
+        "convergence",
+    ),
+    "head": ("imperfections",),
+}
 _PACKAGES = (
     *("torchptz", "torch", "numpy", "scipy", "opencv-python-headless", "kornia"),
     *("lensfunpy", "discorpy", "hypothesis"),
@@ -85,27 +90,64 @@ def main() -> None:
     pass
 
 
+def _options(command: str) -> Callable:
+    """What every command takes; ``only`` is one of its own sections."""
+    sections = SECTIONS[command]
+    options = [
+        click.option(
+            "--json", "json_path", type=_FILE, required=True, help="File for all figures."
+        ),
+        click.option("--markdown", type=_FILE, help="File for the tables."),
+        click.option("--quick", is_flag=True, help="Few seeds and items: a smoke test."),
+        click.option(
+            "--only",
+            type=click.Choice(sections),
+            multiple=True,
+            metavar="SECTION",
+            help="Run this section only; can be repeated. "
+            f"{'There are' if len(sections) > 1 else 'There is'}: {', '.join(sections)}.",
+        ),
+        click.option(
+            "--device", default="cpu", show_default=True, help="Where sections that can compute."
+        ),
+    ]
+
+    def decorate(function: Callable) -> Callable:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
 @main.command()
-@click.option("--json", "json_path", type=_FILE, required=True, help="File for all figures.")
-@click.option("--markdown", type=_FILE, help="File for the tables.")
-@click.option("--quick", is_flag=True, help="Few seeds and items: a smoke test.")
-@click.option(
-    "--only",
-    type=click.Choice(SECTIONS),
-    multiple=True,
-    metavar="SECTION",
-    help=f"Run this section only; can be repeated. There are: {', '.join(SECTIONS)}.",
-)
-@click.option("--device", default="cpu", show_default=True, help="Where sections that can compute.")
-def accuracy(
-    json_path: Path, markdown: Path | None, quick: bool, only: tuple[str, ...], device: str
-) -> None:
+@_options("accuracy")
+def accuracy(**options: object) -> None:
     """Measure how accurate the estimator is, and check what it promises."""
+    _measure("accuracy", **options)
+
+
+@main.command()
+@_options("head")
+def head(**options: object) -> None:
+    """Measure what the complete calibration makes of imperfect heads, and check it."""
+    _measure("head", **options)
+
+
+def _measure(
+    command: str,
+    json_path: Path,
+    markdown: Path | None,
+    quick: bool,
+    only: tuple[str, ...],
+    device: str,
+) -> None:
+    """Run a command's sections, write what they find, and exit."""
     _check_device(device)
     started = time.perf_counter()
-    asked = [name for name in SECTIONS if not only or name in only]
+    asked = [name for name in SECTIONS[command] if not only or name in only]
     report: dict = {
-        "command": "accuracy",
+        "command": command,
         "quick": quick,
         "environment": environment(),
         "sections_asked": asked,
@@ -118,7 +160,7 @@ def accuracy(
     try:
         for name in asked:
             click.echo(f"{name} ...")
-            done.append(run_section(name, quick, device))
+            done.append(run_section(command, name, quick, device))
             _write(report, done, started, json_path, markdown)
             _print(done[-1])
     except KeyboardInterrupt:
@@ -140,18 +182,19 @@ def _check_device(device: str) -> None:
         raise click.BadParameter(f"{device!r}: {reason}", param_hint="--device") from error
 
 
-def run_section(name: str, quick: bool, device: str = "cpu") -> Section:
+def run_section(command: str, name: str, quick: bool, device: str = "cpu") -> Section:
     """Run one section; whatever it raises becomes its error.
 
     Args:
-        name: a module of `accuracy`.
+        command: the package that it is in.
+        name: its module.
         quick: few seeds and items.
         device: for a section whose `run` takes one; the others compute where they always do.
     """
     section = Section(name, name)
     started = time.perf_counter()
     try:
-        module = _load(name)
+        module = _load(command, name)
         section.title = module.TITLE
         where = {"device": device} if "device" in inspect.signature(module.run).parameters else {}
         figures = module.run(quick, **where)
@@ -182,8 +225,8 @@ def environment() -> dict:
     }
 
 
-def _load(name: str) -> ModuleType:
-    return importlib.import_module(f"accuracy.{name}")
+def _load(command: str, name: str) -> ModuleType:
+    return importlib.import_module(f"{command}.{name}")
 
 
 def _version(name: str) -> str | None:
@@ -206,7 +249,8 @@ def _write(
         versions = ", ".join(f"{k} {v}" for k, v in report["environment"]["versions"].items() if v)
         environment = report["environment"]
         heading = (
-            f"# Accuracy{quick}\n\n{environment['system']} {environment['machine']}, "
+            f"# {report['command'].capitalize()}{quick}\n\n"
+            f"{environment['system']} {environment['machine']}, "
             f"{environment['cpus']} CPUs, {environment['threads']} threads; "
             f"Python {environment['python']}, {versions}\n\n"
         )

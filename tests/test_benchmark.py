@@ -49,14 +49,14 @@ def interrupt(quick):
 
 @pytest.fixture
 def call(benchmark, monkeypatch, tmp_path):
-    """Run `accuracy` on given sections; exit code, report and output."""
+    """Run a command on given sections; exit code, report and output."""
 
-    def run(sections, *arguments):
-        monkeypatch.setattr(benchmark, "SECTIONS", tuple(sections))
-        monkeypatch.setattr(benchmark, "_load", sections.__getitem__)
+    def run(sections, *arguments, command="accuracy"):
+        monkeypatch.setattr(benchmark, "SECTIONS", {command: tuple(sections)})
+        monkeypatch.setattr(benchmark, "_load", lambda package, name: sections[name])
         path = tmp_path / "report.json"
         result = CliRunner().invoke(
-            benchmark.main, ["accuracy", "--json", str(path), *arguments], standalone_mode=False
+            benchmark.main, [command, "--json", str(path), *arguments], standalone_mode=False
         )
         code = result.exit_code
         return code, json.loads(path.read_text()) if path.exists() else None, result.output
@@ -108,7 +108,7 @@ class TestFront:
         assert report["sections"]["nan"]["figures"] == {"value": None}
 
     def test_a_section_that_cannot_be_imported(self, benchmark):
-        done = benchmark.run_section("nowhere_to_be_found", quick=True)
+        done = benchmark.run_section("accuracy", "nowhere_to_be_found", quick=True)
         assert "ModuleNotFoundError" in done.error
         assert not done.holds
 
@@ -124,6 +124,22 @@ class TestFront:
         assert result.exit_code == 2
         assert "paper_experiment" in result.output
         assert not (tmp_path / "r.json").exists()
+
+    def test_commands_differ_in_their_sections_alone(self, benchmark, call, tmp_path):
+        markdown = tmp_path / "tables.md"
+        code, report, _ = call(
+            {"one": section()}, "--quick", "--markdown", str(markdown), command="head"
+        )
+        assert (code, report["command"], list(report["sections"])) == (0, "head", ["one"])
+        assert markdown.read_text().startswith("# Head (quick)")
+        arguments = ["head", "--json", str(tmp_path / "r.json"), "--only", "offsets"]
+        assert CliRunner().invoke(benchmark.main, arguments).exit_code == 2
+
+    def test_every_section_is_there(self, benchmark):
+        for command, names in benchmark.SECTIONS.items():
+            for name in names:
+                module = benchmark._load(command, name)
+                assert all(hasattr(module, part) for part in ("TITLE", "run", "table", "checks"))
 
     def test_an_interrupt_leaves_what_was_measured(self, call):
         code, report, _ = call({"one": section(), "two": section(run=interrupt)})

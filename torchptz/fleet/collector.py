@@ -15,6 +15,7 @@ import torch
 from torchptz.cameras import Camera, CameraError, Pose, open_camera
 from torchptz.estimation import estimate_magnification, estimate_principal_point
 from torchptz.fleet.config import CameraConfig
+from torchptz.fleet.designed import DesignedCollection
 from torchptz.fleet.journal import Journal
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.patterns import LinePatterns
@@ -184,6 +185,7 @@ class Collector:
         record.head_errors = head_errors.by_source()
         record.save(self._folder)
 
+        chosen: list[View] = []
         for index, zoom in enumerate(zooms):
             level = levels.index(zoom)
             measured, focal_length = float(levelled[level]), ray.focal_length * relative[level]
@@ -209,7 +211,14 @@ class Collector:
                 radius=float(radius if np.isfinite(radius) else found.radius * relative[level]),
                 head_errors=head_errors,
             )
-            self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
+            if config.scan.design == "optimal":
+                chosen.append(view)
+            else:
+                self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
+        if chosen:
+            DesignedCollection(
+                observer, chosen, ray.ray, record, self._folder, config.scan, self._tell
+            ).run()
 
     def _collect_zoom(
         self,
