@@ -33,7 +33,7 @@ SECTIONS = {
         *("paper_experiment", "lensfun", "real_sets", "catalogue", "offsets", "outliers"),
         "convergence",
     ),
-    "head": ("imperfections",),
+    "head": ("imperfections", "views"),
 }
 _PACKAGES = (
     *("torchptz", "torch", "numpy", "scipy", "opencv-python-headless", "kornia"),

@@ -34,7 +34,8 @@ class Knot:
     usable: bool | None = None  # whether `ZoomTable.at` may use it; default: status is OK
     nominal_zoom: float | None = None  # magnification that was asked for
     zoom_units: float | None = None  # the device's own
-    rms_px: float | None = None  # px, distance of the points from their lines
+    # px, distance of the points from their lines; or, with the head, from where it put them
+    rms_px: float | None = None
     gain: float | None = None  # of the offsets
     gain_sigma: float | None = None
     # (2+K, 2+K), order (cx px, cy px, coefficients); inf on the diagonal of what is not known;

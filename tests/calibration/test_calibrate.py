@@ -129,10 +129,10 @@ class TestGauge:
 def cameras():
     """Different zooms, features, lengths, noise; one with outliers."""
     out = [
-        looks(0, jitter=0.3)[1][0],
-        looks(1, zooms=(1.0, 4.0), features=2, grid=(5, 4))[1][0],
+        looks(0, jitter=0.3, grid=(5, 4))[1][0],
+        looks(1, zooms=(1.0, 4.0), features=2, grid=(4, 3))[1][0],
         looks(2, zooms=(2.0,), jitter=1.0)[1][0],
-        looks(3, grid=(5, 4))[1][0],
+        looks(3, grid=(4, 3))[1][0],
     ]
     rng = np.random.default_rng(0)
     wrong = rng.random(len(out[0]["zoom"])) < 0.15
@@ -144,6 +144,40 @@ def cameras():
 @pytest.fixture(scope="module")
 def together(cameras):
     return calibrate(*cameras)
+
+
+GARBAGE = (
+    *("random pixels", "random readings", "huge readings", "one look", "nothing found"),
+    *("one pose", "one pixel", "tiny sigma", "huge sigma", "not a number", "infinite"),
+)
+
+
+@pytest.fixture(scope="module")
+def garbage(cameras):
+    """One of each kind between two good cameras."""
+    one, rng = cameras[3], np.random.default_rng(1)
+    count = len(one["zoom"])
+    still = np.tile(one["read"][:1], (count, 1))
+    first = {name: value[:1] for name, value in one.items() if isinstance(value, np.ndarray)}
+    broken = {
+        "random pixels": {"pixel": rng.uniform(10, 530, (count, 2))},
+        "random readings": {"read": rng.normal(size=(count, 2))},
+        "huge readings": {"read": np.full((count, 2), 1e300)},
+        "one look": first,
+        "nothing found": {"pixel": np.full((count, 2), np.nan)},
+        "one pose": {"read": still, "commanded": still},
+        "one pixel": {"pixel": np.full((count, 2), 100.0)},
+        "tiny sigma": {"sigma": np.full(count, 1e-12)},
+        "huge sigma": {"sigma": np.full(count, 1e12)},
+    }
+    between = [{**one, **broken.get(kind, {})} for kind in GARBAGE]
+    seen = Observations.from_lists([cameras[0], *between, cameras[2]])
+    # What `from_lists` would not take.
+    spoilt = {name: getattr(seen, name).clone() for name in ("read", "pixel", "sigma")}
+    for kind, value in (("not a number", math.nan), ("infinite", math.inf)):
+        for look, tensor in zip((5, 9, 13), spoilt.values(), strict=True):
+            tensor[1 + GARBAGE.index(kind), look] = value
+    return tp.calibrate(replace(seen, **spoilt), PRIORS)
 
 
 class TestIndependence:
@@ -162,51 +196,26 @@ class TestIndependence:
             different = differences(shuffled, place, together, c)
             assert max(different.values()) < 1e-9, different
 
-    GARBAGE = (
-        *("random pixels", "random readings", "huge readings", "one look", "nothing found"),
-        *("one pose", "one pixel", "tiny sigma", "huge sigma", "not a number", "infinite"),
-    )
+    def test_garbage_harms_nobody_else(self, together, garbage):
+        for place, c in ((0, 0), (len(garbage) - 1, 2)):
+            different = differences(garbage, place, together, c)
+            assert max(different.values()) < 1e-8, different
 
     @pytest.mark.parametrize("kind", GARBAGE)
-    def test_garbage_harms_nobody_else(self, cameras, together, kind):
-        one, rng = cameras[3], np.random.default_rng(1)
-        count = len(one["zoom"])
-        still = np.tile(one["read"][:1], (count, 1))
-        broken = {
-            "random pixels": {"pixel": rng.uniform(10, 530, (count, 2))},
-            "random readings": {"read": rng.normal(size=(count, 2))},
-            "huge readings": {"read": np.full((count, 2), 1e300)},
-            "one look": {
-                name: value[:1] for name, value in one.items() if isinstance(value, np.ndarray)
-            },
-            "nothing found": {"pixel": np.full((count, 2), np.nan)},
-            "one pose": {"read": still, "commanded": still},
-            "one pixel": {"pixel": np.full((count, 2), 100.0)},
-            "tiny sigma": {"sigma": np.full(count, 1e-12)},
-            "huge sigma": {"sigma": np.full(count, 1e12)},
-        }.get(kind, {})
-        seen = Observations.from_lists([cameras[0], {**one, **broken}, cameras[2]])
-        if kind in ("not a number", "infinite"):  # from_lists would not take them
-            value = math.nan if kind == "not a number" else math.inf
-            spoilt = {name: getattr(seen, name).clone() for name in ("read", "pixel", "sigma")}
-            for name, tensor in spoilt.items():
-                tensor[1, {"read": 5, "pixel": 9, "sigma": 13}[name]] = value
-            seen = replace(seen, **spoilt)
-        found = tp.calibrate(seen, PRIORS)
-        for place, c in ((0, 0), (2, 2)):
-            different = differences(found, place, together, c)
-            assert max(different.values()) < 1e-7, different
-        assert not bool(found.theta[1].isnan().any())
-        assert not bool(found.covariance[1].isnan().any())
-        assert not bool(found.intrinsics_covariance.isnan().any())
-        assert bool((found.intrinsics_covariance.diagonal(dim1=1, dim2=2) >= 0).all())
-        if kind in ("not a number", "infinite"):  # three looks of sixty
-            assert {status.name for status in found.status[1]} == {"OK"}
-            different = found.focal_length[1] - together.focal_length[3]
-            assert (different.abs() / together.focal_length_sigma[3]).max() < 1
+    def test_garbage_is_told_from_calibrations(self, together, garbage, kind):
+        c = 1 + GARBAGE.index(kind)
+        assert bool(garbage.theta[c].isfinite().all())
+        assert bool(garbage.covariance[c].isfinite().all())
+        own = garbage.intrinsics_covariance[garbage.pairs[:, 0] == c]
+        assert bool(own.isfinite().all())
+        assert bool((own.diagonal(dim1=1, dim2=2) >= 0).all())
+        names = {garbage.status[c][zoom].name for zoom in garbage.exists[c].nonzero()[:, 0]}
+        if kind in ("not a number", "infinite"):  # three looks of many
+            assert names == {"OK"}
+            off = garbage.focal_length[c] - together.focal_length[3]
+            assert (off.abs() / together.focal_length_sigma[3]).max() < 1
         elif not kind.endswith("sigma"):
-            seen_through = found.exists[1].nonzero()[:, 0].tolist()
-            assert "OK" not in {found.status[1][zoom].name for zoom in seen_through}
+            assert "OK" not in names
 
     def test_in_parts_it_is_the_same(self, cameras, together, monkeypatch):
         """As many at a time as the memory is good for."""
@@ -219,8 +228,8 @@ class TestIndependence:
 
 @pytest.fixture(scope="module")
 def case():
-    """A camera with a play under 6 draws of noise."""
-    return looks(1, grid=(9, 7), jitter=0.3, draws=6, backlash=(5e-4, 5e-4))
+    """A camera with a play under 5 draws of noise."""
+    return looks(1, grid=(9, 7), jitter=0.3, draws=5, backlash=(5e-4, 5e-4))
 
 
 class TestOutliers:
@@ -313,7 +322,7 @@ class TestPriors:
     def test_two_features_at_different_distances_tell_the_pupil(self):
         ray, distance = np.array([[0.3, 0.1], [-0.6, 0.5]]), np.array([2.0, 20.0])
         pupil = np.array([0.02, 0.05, 0.08])
-        _, cameras = looks(1, features=2, ray=ray, distance=distance, pupil=pupil, draws=8)
+        _, cameras = looks(1, features=2, ray=ray, distance=distance, pupil=pupil, draws=5)
         priors = tp.Priors(distance_m=torch.from_numpy(distance)[None], distance_sigma_m=0.005)
         found = calibrate(*cameras, priors=priors)
         assert (found.pupil_sigma_m < 0.002).all()
@@ -354,13 +363,13 @@ class TestPriors:
         """Which is then known much better: the lens tells it."""
         made = head_body.body(1)
         made = replace(made, center=made.point)
-        seen = head_body.observed(made, draws=6)
+        seen = head_body.observed(made, draws=4)
         found = tp.calibrate(seen, replace(PRIORS, decentering_sigma=0.0))
         torch.testing.assert_close(found.center, found.principal_point, rtol=0, atol=0)
         sigma = found.intrinsics_covariance.diagonal(dim1=1, dim2=2).sqrt()[:, -2:]
         off = (found.principal_point - torch.from_numpy(made.point)).flatten(0, 1) / sigma
         assert off.square().mean().sqrt() < 1.5
-        assert sigma.reshape(6, 3, 2)[:, 0].max() < 0.2
+        assert sigma.reshape(4, 3, 2)[:, 0].max() < 0.2
 
     def test_a_focal_length_that_is_known(self):
         """With a prior from elsewhere that is better than the data."""
@@ -375,7 +384,7 @@ class TestPriors:
 
     def test_scales_of_the_axes_are_found(self):
         made, cameras = looks(
-            1, scale=(1.01, 0.99), features=2, ray=np.array([[1.0, 0.1], [-1.0, 0.8]]), draws=6
+            1, scale=(1.01, 0.99), features=2, ray=np.array([[1.0, 0.1], [-1.0, 0.8]]), draws=4
         )
         found = calibrate(*cameras, priors=replace(PRIORS, axis_scale_sigma=0.02))
         sigma = torch.stack([found.head_sigma["pan scale"], found.head_sigma["tilt scale"]], -1)
@@ -386,17 +395,19 @@ class TestPriors:
         assert off.square().mean().sqrt() < 1.8
         assert {status.name for row in found.status for status in row} == {"OK"}
 
-    @pytest.mark.parametrize("signs", [(-1, 1), (1, -1), (-1, -1)])
-    def test_and_their_signs(self, signs):
+    def test_and_their_signs(self):
         made, (one,) = looks(1)
-        turned = {name: one[name] * signs for name in ("read", "commanded")}
-        found = calibrate({**one, **turned}, priors=replace(PRIORS, axis_scale_sigma=0.02))
-        assert found.axis_scale.sign().tolist() == [list(signs)]
+        signs = [(1, 1), (-1, 1), (1, -1), (-1, -1)]
+        cameras = [
+            {**one, **{name: one[name] * sign for name in ("read", "commanded")}} for sign in signs
+        ]
+        found = calibrate(*cameras, priors=replace(PRIORS, axis_scale_sigma=0.02))
+        assert found.axis_scale.sign().tolist() == [list(sign) for sign in signs]
         off = (found.focal_length - torch.from_numpy(made.focal)) / found.focal_length_sigma
         assert off.abs().max() < 4
 
     def test_the_pixel_aspect_is_found(self):
-        made, cameras = looks(1, aspect=1.03, draws=6)
+        made, cameras = looks(1, aspect=1.03, draws=4)
         found = calibrate(*cameras, priors=replace(PRIORS, pixel_aspect_sigma=0.05))
         sigma = found.head_sigma["pixel aspect"]
         assert (sigma < 1e-3).all()
@@ -435,21 +446,25 @@ class TestBodies:
     """Cameras that are hard to start with, or see little."""
 
     @pytest.mark.parametrize("body", BODIES.values(), ids=BODIES)
-    @pytest.mark.parametrize("quantum", [head_body.QUANTUM, head_body.FINE, (0.0, 0.0)])
-    def test_are_calibrated(self, body, quantum):
+    def test_are_calibrated(self, body):
+        """With a head of coarse steps, of fine ones, and of none."""
         if "size" in body:
             made = head_body.body(3)
             middle = np.array([272.0, 368.0]) - (368.0, 272.0)
             made = replace(made, point=made.point + middle, center=made.center + middle, **body)
         else:
             made = head_body.body(3, **body)
-        planned = head_body.plan(made, quantum=quantum)
-        found = tp.calibrate(head_body.observed(made, planned, draws=2), PRIORS)
+        cameras = []
+        for quantum in (head_body.QUANTUM, head_body.FINE, (0.0, 0.0)):
+            planned = head_body.plan(made, quantum=quantum, grid=(7, 5))
+            cameras += head_body.looks(made, planned)
+        found = calibrate(*cameras)
         names = {status.name for row in found.status for status in row}
         assert names <= {"OK", "DISTORTION_UNOBSERVABLE"}
         off = (found.focal_length - torch.from_numpy(made.focal)) / found.focal_length_sigma
         assert off.abs().max() < 4.5
-        assert found.inliers.sum() >= 0.99 * head_body.observed(made, planned, draws=2).found.sum()
+        seen = Observations.from_lists(cameras).found
+        assert found.inliers.sum() >= 0.98 * seen.sum()
 
     def test_a_sensor_on_its_side(self):
         _, cameras = looks(3, roll=math.pi / 2)

@@ -68,7 +68,7 @@ def shape_errors(calibration, made):
 
 class TestNone:
     def test_where_the_powers_follow_the_lens(self):
-        made, seen = observed(CUBIC, 12)
+        made, seen = observed(CUBIC, 10)
         calibration = tp.calibrate(seen, PRIORS)
         assert there(calibration).double().mean() <= 0.1
         assert shape_errors(calibration, made).median() < 1.6
@@ -81,7 +81,7 @@ class TestNone:
 
 @pytest.fixture(scope="module", params=STRANGE.values(), ids=STRANGE)
 def case(request):
-    made, seen = observed(request.param, 6)
+    made, seen = observed(request.param, 5)
     return made, seen, tp.calibrate(seen, PRIORS)
 
 

@@ -149,11 +149,14 @@ def _assumed_noise(priors: Priors, o: Observations) -> Noise:
     """A head that stops anywhere and reports the nearest multiple of its quantum."""
     like = {"dtype": o.quantum.dtype, "device": o.quantum.device}
     repeatability = torch.as_tensor(priors.repeatability, **like).reshape(-1, 1)
+    if len(repeatability) not in {1, len(o)}:
+        raise ValueError(f"repeatability must be a number or of shape {(len(o),)}")
     head = (o.quantum**2 / 12 + repeatability**2).clamp_min(_FINEST_READING**2)
     return Noise(head.expand(len(o), 2), torch.ones_like(head[:, 0]))
 
 
-_FINEST_READING = 1e-6  # rad
+# rad: of a head without a quantum or with a very fine one, sought about and never called strange
+_FINEST_READING, _PLAUSIBLE_READING = 1e-5, 3e-4
 
 
 def _started(problem: Problem, o: Observations, known: Known, noise: Noise) -> tuple[Tensor, Known]:
@@ -233,7 +236,8 @@ def _summed_up(
     )
     grown = replace(calibration, misfit=misfit_of(chosen, refined, known))
     # Beyond what any head or detection does, it is not noise.
-    strange = (refined.noise.head > _STRANGE**2 * assumed.head).any(1)
+    usual = assumed.head.clamp_min(_PLAUSIBLE_READING**2)
+    strange = (refined.noise.head > _STRANGE**2 * usual).any(1)
     strange |= refined.noise.pixel > _STRANGE**2 * assumed.pixel
     return replace(
         grown, status=statuses(calibration, grown, seen, kept, refined.converged, strange)

@@ -139,7 +139,12 @@ def choose(
 
     Returns:
         Design. No pose is chosen twice: without a move in between it would be the same stop.
+
+    Raises:
+        ValueError: a count below 1.
     """
+    if count < 1:
+        raise ValueError(f"count must be 1 or more, not {count}")
     costs = costs or Costs()
     c, device = calibration, calibration.theta.device
     goal = torch.as_tensor(goal, dtype=torch.float64, device=device).expand(c.exists.shape)

@@ -14,11 +14,11 @@ from torchptz.calibration.parameters import Layout
 from torchptz.observations import Observations
 
 _DEGREE = math.radians(1.0)
-_UNKNOWN_DISTANCE = 10.0  # m
-_UNKNOWN_DISTANCE_SIGMA = 0.05  # 1/m, of the nearness
+_UNKNOWN_DISTANCE = 5.0  # m
+_UNKNOWN_DISTANCE_SIGMA = 0.1  # 1/m, of the nearness
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Priors:
     """Means and standard deviations; a sigma of 0 holds a value, inf knows nothing of it.
 
@@ -47,7 +47,7 @@ class Priors:
         backlash_sigma: rad, of the play's full width on either axis.
         pupil_m: m, how far the entrance pupil lies ahead of the head's axes.
         pupil_sigma_m: m.
-        distance_m: m, of the features; None: not known, about 10 m or more.
+        distance_m: m, of the features; None: not known, and taken for 5 m or more.
         distance_sigma_m: m; None: 5 %.
         repeatability: rad, one sigma of how well the head stops where it reads, beside its
             quantum: where the noise of the readings is sought from.
@@ -119,7 +119,7 @@ class Known(Batched):
         return torch.where(self.free, self.sigma, torch.inf) ** -2
 
     def with_coefficients_held(self, layout: Layout, first: int, zooms: Tensor) -> Known:
-        """The same with the coefficients but the ``first`` held at ``zooms`` (C, Z) bool."""
+        """The same (C, T) with the coefficients but the ``first`` held at ``zooms`` (C, Z) bool."""
         levels, head, features = layout.split(self.sigma)
         levels = levels.clone()
         more = levels[..., at.COEFFICIENTS + first : layout.pupil]
@@ -127,7 +127,7 @@ class Known(Batched):
         return Known(self.mean, layout.join(levels, head, features))
 
     def of_lenses(self, layout: Layout) -> Known:
-        """The same with all held but the zooms' lenses, the principal point and the roll."""
+        """The same (C, T) with all held but the zooms' lenses, the principal point and the roll."""
         zooms, head, features = layout.split(self.sigma)
         zooms, kept = zooms.clone(), torch.zeros_like(head)
         zooms[..., layout.pupil] = 0.0

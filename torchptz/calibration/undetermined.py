@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import torch
+
 from torchptz.calibration import parameters as at
 
 if TYPE_CHECKING:
@@ -23,26 +25,50 @@ class Undetermined:
 
     name: str
     zooms: tuple[float, ...]  # nominal magnifications it belongs to; none: the camera
-    sigma: float | None  # what is left of it, in its unit; None: nobody can know it
+    sigma: float | None  # what is left of it, in its unit; None: that is no number
     unit: str
     advice: str
+    gauge: bool = False  # no camera can ever tell it
 
     def __str__(self) -> str:
         where = f" at {', '.join(f'{zoom:g}x' for zoom in self.zooms)}" if self.zooms else ""
-        known = "" if self.sigma is None else f" known to {self.sigma:.2g} {self.unit} only"
-        return f"{self.name}{where}{known}: {self.advice}"
+        known = "" if self.sigma is None else f" known to {self.sigma:.2g} {self.unit}".rstrip()
+        return f"{self.name}{where}{known and f'{known} only'}: {self.advice}"
 
 
+_ONE_SIDE = "poses were approached from one side only, where it does no harm"
 _HEAD_ADVICE = {
+    "principal point x": "let the feature be seen all over the picture at the wide end",
+    "principal point y": "let the feature be seen all over the picture at the wide end",
     "tilt zero": "let the feature be seen from more tilts, far apart, at the wide end",
     "boresight": "let the feature be seen all over the picture at the wide end",
     "roll": "let the feature be seen all over the picture",
     "pan scale": "turn the head farther, with a second feature far aside",
     "tilt scale": "turn the head farther, with a second feature at another tilt",
     "pixel aspect": "let the feature be seen all over the picture, or state the aspect",
-    "pan backlash": "poses were approached from one side only, where it does no harm",
-    "tilt backlash": "poses were approached from one side only, where it does no harm",
+    "pan backlash": _ONE_SIDE,
+    "tilt backlash": _ONE_SIDE,
 }
+_OF_A_LENS = (
+    (
+        "wander of the principal point",
+        lambda layout: at.WANDER,
+        "px",
+        "at a long zoom a shift of the picture is a turn of the head, and matters as little",
+    ),
+    (
+        "the distortion's centre beside the principal point",
+        lambda layout: at.DECENTERING,
+        "px",
+        "there is next to no distortion here to have a centre, and it matters as little",
+    ),
+    (
+        "a coefficient of the distortion",
+        lambda layout: slice(at.COEFFICIENTS, layout.pupil),
+        "",
+        "look at more places of the picture, or use fewer powers",
+    ),
+)
 _DEGREES = ("tilt zero", "boresight", "roll", "pan backlash", "tilt backlash")
 _GAUGES = (
     Undetermined(
@@ -51,6 +77,7 @@ _GAUGES = (
         None,
         "",
         "the head's own zero is taken; another one would turn the features' rays, and no lens",
+        gauge=True,
     ),
     Undetermined(
         "tilt zero and the optical axis' turn about the tilt axis",
@@ -58,6 +85,7 @@ _GAUGES = (
         None,
         "",
         "they are one rotation and only their sum exists, here as the tilt zero",
+        gauge=True,
     ),
 )
 
@@ -79,6 +107,8 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
     relative = (calibration.focal_length_sigma / calibration.focal_length).cpu()
     distance = calibration.distance_m.cpu()
     exists = calibration.exists.cpu()
+    # Features that a camera does not have are held.
+    ray_free = (layout.split(calibration.known.sigma)[2][..., 0] > 0).cpu()
     found = []
     for c in range(len(calibration)):
         zooms = exists[c].nonzero()[:, 0].tolist()
@@ -86,7 +116,7 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
         one = []
         pupils = [z for z in zooms if zoom_left[c, z, layout.pupil]]
         if pupils:
-            nearest = float((1 / distance[c]).max())
+            nearest = float(torch.where(ray_free[c], 1 / distance[c], 0.0).max())
             worst = nearest * max(float(zoom_sigma[c, z, layout.pupil]) for z in pupils)
             one.append(
                 Undetermined(
@@ -110,20 +140,25 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
                     "scan more of the picture, or a head that reads its position better",
                 )
             )
+        for what, places, unit, advice in _OF_A_LENS:
+            level = zoom_left[c, :, places(layout)]
+            open_ones = [z for z in zooms if bool(level[z].any())]
+            if open_ones:
+                worst = max(float(zoom_sigma[c, z, places(layout)].max()) for z in open_ones)
+                here = tuple(name[z] for z in open_ones)
+                one.append(Undetermined(what, here, worst, unit, advice))
         for number, what in enumerate(at.HEAD):
             if what in _HEAD_ADVICE and head_left[c, number]:
-                value = float(head_sigma[c, number])
-                degrees = what in _DEGREES
-                one.append(
-                    Undetermined(
-                        what,
-                        (),
-                        math.degrees(value) if degrees else 100 * value,
-                        "degrees" if degrees else "%",
-                        _HEAD_ADVICE[what],
-                    )
-                )
-        farthest = calibration.pupil_m[c].abs().nan_to_num(0.0).max().item()
+                value, unit = float(head_sigma[c, number]), "%"
+                if what in _DEGREES:
+                    value, unit = math.degrees(value), "degrees"
+                elif what.startswith("principal"):
+                    unit = "px"
+                else:
+                    value *= 100
+                one.append(Undetermined(what, (), value, unit, _HEAD_ADVICE[what]))
+        reach = calibration.pupil_m[c].abs() + 2 * calibration.pupil_sigma_m[c]
+        farthest = reach.nan_to_num(0.0).max().item()
         for feature in feature_left[c, :, 2].nonzero()[:, 0].tolist():
             away = float(distance[c, feature])
             if farthest * float(feature_sigma[c, feature, 2]) < _MATTERS:
@@ -134,8 +169,8 @@ def undetermined(calibration: Calibration) -> list[list[Undetermined]]:
                     (),
                     float(feature_sigma[c, feature, 2]) * away**2,
                     "m",
-                    "it matters as far as the entrance pupil does: measure it, and state it "
-                    "(distance_m)",
+                    f"{away:.2g} m was taken for it, and it matters as far as the entrance pupil "
+                    "does: measure it, and state it (distance_m)",
                 )
             )
         noise = float(calibration.noise_factor[c])

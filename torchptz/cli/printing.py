@@ -29,6 +29,8 @@ def print_summary(summary: Summary, run: Path) -> None:
     for name, camera in summary.cameras.items():
         if camera.head is not None:
             click.echo(f"{name}: {head_line(camera.head)}")
+        if camera.views_ended is not None:
+            click.echo(f"{name}: no more views: {camera.views_ended}")
         for thing in camera.undetermined:
             click.echo(f"{name}: not determined: {thing}")
     for name, camera in summary.cameras.items():

@@ -17,6 +17,7 @@ from torchptz.calibration.candidates import Reach, Views, candidates
 from torchptz.calibration.design import choose, exhausted, largest_sigma
 from torchptz.calibration.route import Start
 from torchptz.cameras import CameraError, Capabilities
+from torchptz.estimation import Status
 from torchptz.fleet.config_sections import ScanConfig
 from torchptz.fleet.observations import observed
 from torchptz.fleet.priors import priors_of
@@ -34,6 +35,8 @@ _PATIENCE, _GAIN = 5, 0.01  # batches, and the share of the worst sigma that the
 # What so many times the most views would leave is what views cannot tell, and with a sigma that is
 # so much larger a zoom is known as well as they can make it.
 _FAR_MORE, _NEARLY = 10.0, 1.4
+# Statuses of lenses whose sigma is right: good, or not yet well enough known.
+_SOUND = (Status.OK, Status.DISTORTION_UNOBSERVABLE, Status.MISFIT)
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,13 @@ class _Known:
     def names(self, zooms: Sequence[int]) -> str:
         """How well zooms are known, in words."""
         nominal = self.calibration.zooms[0]
-        return ", ".join(f"{float(self.sigma[z]):.2g} px at {float(nominal[z]):g}x" for z in zooms)
+        status = self.calibration.status[0]
+        return ", ".join(
+            f"{float(self.sigma[z]):.2g} px at {float(nominal[z]):g}x"
+            if status[z] in _SOUND
+            else f"{float(nominal[z]):g}x: {status[z].value}"
+            for z in zooms
+        )
 
 
 class DesignedCollection:
@@ -171,13 +180,15 @@ class DesignedCollection:
         times = _FAR_MORE * most * len(self._views) / max(1, int(possible.looks.sum()))
         floor = exhausted(calibration, possible, noise, times)
         least = largest_sigma(calibration, covariance=floor)[0].nan_to_num(0.0)
+        # A sigma says nothing of a lens that is wrong in another way.
+        lost = torch.tensor([one not in _SOUND for one in calibration.status[0]])
         return _Known(
             calibration,
             observations,
             levels,
             possible,
             noise,
-            largest_sigma(calibration)[0].nan_to_num(torch.inf),
+            torch.where(lost, torch.inf, largest_sigma(calibration)[0].nan_to_num(torch.inf)),
             least,
             self._goal(levels, least),
         )
@@ -219,9 +230,7 @@ class DesignedCollection:
         if full := [zoom for zoom, all_taken in over if all_taken]:
             reasons.append(f"most_views ({most} at a zoom) were taken: {known.names(full)}")
         if rest := [zoom for zoom, all_taken in over if not all_taken]:
-            advice = [
-                str(one) for one in known.calibration.undetermined[0] if one.sigma is not None
-            ]
+            advice = [str(one) for one in known.calibration.undetermined[0] if not one.gauge]
             if bool(known.calibration.misfit.any()):
                 advice.append("the powers cannot follow the lens: solve with other powers")
             because = f" ({'; '.join(advice)})" if advice else ""

@@ -63,7 +63,12 @@ def solve_heads(
     priors = priors_of([records[name] for name in looks], observations)
     calibration = calibrate(observations, priors, powers, robust)
     for camera, name in enumerate(looks):
-        solutions[name] = _solution(records[name], observations[camera], calibration[camera])
+        record = records[name]
+        try:
+            solutions[name] = _solution(record, observations[camera], calibration[camera])
+        except ValueError as error:
+            zooms = tuple(failed_zoom(zoom, str(error)) for zoom in record.zooms)
+            solutions[name] = Solution(zooms, error=str(error))
     return solutions
 
 
@@ -74,7 +79,7 @@ def _solution(record: CameraRecord, observations: Observations, one: Calibration
     zooms, knots = [], []
     for zoom, level, measured in zip(record.zooms, levels, magnification, strict=True):
         if level is None:
-            zooms.append(failed_zoom(zoom, "the feature was not found at this zoom"))
+            zooms.append(failed_zoom(zoom, zoom.error or "the feature was not found at this zoom"))
             continue
         result, knot = _zoom(zoom, observations, one, level, measured)
         zooms.append(result)
@@ -84,7 +89,7 @@ def _solution(record: CameraRecord, observations: Observations, one: Calibration
         tuple(knots),
         head=_head(one, observations.quantum[0]),
         # Without what no camera can know: it says nothing of this one.
-        undetermined=tuple(str(thing) for thing in one.undetermined[0] if thing.sigma is not None),
+        undetermined=tuple(str(thing) for thing in one.undetermined[0] if not thing.gauge),
     )
 
 

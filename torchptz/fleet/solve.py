@@ -158,4 +158,6 @@ def _written(path: Path, record: CameraRecord, solution: Solution) -> CameraResu
             table = f"{path.parent.name}/{path.name}"
         except ValueError as problem:
             error = error or str(problem)
-    return CameraResult(solution.zooms, table, error, solution.head, solution.undetermined)
+    return CameraResult(
+        solution.zooms, table, error, solution.head, solution.undetermined, record.views_ended
+    )

@@ -21,7 +21,9 @@ class ZoomResult:
     zoom_units: float | None  # the device's own
     ok: bool  # it has a lens, and collecting its lines went well
     status: str | None  # name of the fit's status; None where there was nothing to fit
-    rms_px: float | None = None  # px in the picture, per degree of freedom
+    # px in the picture: straightness per degree of freedom; with the head, distance per coordinate
+    # from where its readings put the feature, so that their noise is in it
+    rms_px: float | None = None
     # px, the largest standard deviation of an undistorted point of the picture: by all that was
     # estimated, the head too where its poses were, and by errors of a head that was believed, which
     # no residual shows
@@ -62,6 +64,7 @@ class CameraResult:
     error: str | None  # why the camera as a whole is not ok
     head: HeadResult | None = None  # None where its poses did not enter
     undetermined: tuple[str, ...] = ()  # what the observations could not tell, and what could
+    views_ended: str | None = None  # why no more views were chosen; None: lines were scanned
 
     @property
     def ok(self) -> bool:
