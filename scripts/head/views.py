@@ -38,7 +38,7 @@ CONSISTENT = (0.6, 1.5)  # error over sigma, root mean square
 
 _LINES, _POINTS = 12, 20  # of the collector, horizontal and vertical
 _BATCH, _BATCH_SHARE = 16, 0.08  # of the looks so far, between two calibrations
-_ROUNDS, _CLOSE = 5, 0.1  # until an even spread has as many views as it needs
+_ROUNDS, _CLOSE = 5, 0.1  # until an even spread has what it needs but for this share
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def table(result: dict) -> str:
     for case in result["cases"]:
         for form, name in names.items():
             one = case[form]
-            far = "" if one["looks"] < (1 + 2 * _CLOSE) * one["simulated"] else "~"
+            far = "" if one["sigma_px"] < (1 + _CLOSE) * case["target_px"] else "~"
             error = f"{one['error']:.2f}" if "error" in one else ""
             rows.append(
                 f"| {case['head']} | {case['features']} | {case['part']} | {case['target_px']} "

@@ -41,7 +41,7 @@ class Problem(Batched):
         o = observations
         layout = Layout(o.zooms.shape[1], max(1, o.features), len(powers))
         used = o.found & o.mask & (o.sigma > 0)
-        used &= o.pixel.isfinite().all(-1) & o.read.isfinite().all(-1)
+        used &= o.pixel.isfinite().all(-1) & o.read.isfinite().all(-1) & o.sigma.isfinite()
         return cls(
             layout,
             int(o.stop.max()) + 1,
@@ -86,7 +86,7 @@ class Problem(Batched):
 
 def _motor(o: Observations) -> Tensor:
     """(C, N, 2) mean reading of each stop; padding repeats what was read last."""
-    pan, tilt = torch.where(o.mask.unsqueeze(-1), o.read, 0.0).nan_to_num(0.0).unbind(-1)
+    pan, tilt = torch.where(o.mask.unsqueeze(-1), o.read, 0.0).nan_to_num(0.0, 0.0, 0.0).unbind(-1)
     # Step by step on the circle, so that neither a mean nor the play sees a jump of a turn.
     steps = torch.where(o.mask[:, 1:], wrap_angle(pan.diff(dim=1)), 0.0)
     pan = torch.cat([pan[:, :1], pan[:, :1] + steps.cumsum(1)], 1)
