@@ -252,7 +252,7 @@ def _checked(number: int, one: Mapping) -> dict:
     missing = [name for name in (*_GIVEN, "image_size", "quantum") if name not in one]
     if missing:
         raise ValueError(f"{where}: {', '.join(missing)} missing")
-    count = np.size(one["zoom"])
+    count = _array(one["zoom"], f"{where}: zoom").size
     if count == 0:
         raise ValueError(f"{where}: no observations")
     out: dict = {"camera": str(one.get("camera", number))}
