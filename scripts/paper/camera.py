@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from simulated_pictures import draw_collected, photograph_board, undistortion
+from demo_check import undistortion
+from simulated_pictures import draw_collected, photograph_board
 
 from paper.device import Settings, fleet, simulation
 from torchptz.cameras import CameraError

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from simulated_pictures import undistortion
+from demo_check import undistortion
 from torch import Tensor
 
 from paper.pattern import (

@@ -97,6 +97,11 @@ class TestLens:
 class TestCovariance:
     def test_of_the_intrinsics_is_that_of_theta_carried_over(self, calibrated):
         layout = calibrated.layout
+        torch.manual_seed(0)
+        rows = torch.randn(*calibrated.misfit.shape[:3], 9, dtype=torch.float64)
+        size = torch.tensor([0.1, 0.1, *[1e-3] * 4, 0.1, 0.1], dtype=torch.float64)
+        misfit = rows @ rows.mT * size[:, None] * size
+        calibrated = replace(calibrated, misfit=misfit)
         for item, (camera, zoom) in enumerate(calibrated.pairs.tolist()):
             theta = calibrated.theta[camera]
             jacobian = torch.func.jacrev(intrinsics)(theta, layout, zoom)

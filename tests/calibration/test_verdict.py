@@ -144,5 +144,13 @@ class TestTable:
         table = statuses(calibrated, calibrated, 10 * seen, 10 * seen, no, no)
         assert table[0][0].name == "NOT_CONVERGED"
 
+    @pytest.mark.parametrize(("kept", "name"), [(4, "TOO_FEW_LINES"), (5, "OK")])
+    def test_outliers_do_not_count(self, calibrated, kept, name):
+        """Of 6 looks 4 inliers are 8 coordinates for 9 unknowns."""
+        seen = torch.full_like(calibrated.exists, 6, dtype=torch.long)
+        no = torch.tensor([False] * 3)
+        table = statuses(calibrated, calibrated, seen, kept + 0 * seen, ~no, no)
+        assert table[0][0].name == name
+
     def test_says_what_to_do(self):
         assert "signs" in str(tp.Status.INCONSISTENT.value)

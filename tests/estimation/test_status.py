@@ -92,7 +92,8 @@ def test_a_pattern_gets_the_status_it_deserves(name):
 
 
 def test_no_status_is_without_a_case():
-    assert {status for status, _, _ in CASES.values()} == set(Status)
+    # Only where poses enter can what is seen contradict them; see the calibration's verdicts.
+    assert {status for status, _, _ in CASES.values()} == set(Status) - {Status.INCONSISTENT}
 
 
 def test_items_of_a_batch_get_their_own():
