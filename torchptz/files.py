@@ -57,19 +57,30 @@ def without_nan(value: object) -> object:
     return value
 
 
-def read_arrays(path: str | Path, kind: str) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | Path, kind: str, schema_version: int | None = None
+) -> dict[str, np.ndarray]:
     """The arrays of an NPZ file, by name.
 
-    kind: what the file should be, for the message.
+    kind: what the file should be, for the message. schema_version: that the file must have, as an
+    array of that name, which is left out; None: it has none.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: not such a file, damaged, or one with pickles; names the file.
+        ValueError: not such a file, damaged, one with pickles, or of another version; names it.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
+            arrays = {name: stored[name] for name in stored.files}
     except FileNotFoundError:
         raise
     except _NO_ARRAYS as error:
         raise ValueError(f"{path}: not {kind} ({error})") from error
+    if schema_version is None:
+        return arrays
+    version = arrays.pop("schema_version", None)
+    if version is None:
+        raise ValueError(f"{path}: not {kind} (no schema_version)")
+    if not np.array_equal(version, schema_version):
+        raise ValueError(f"{path}: schema version {version}; this torchptz reads {schema_version}")
+    return arrays

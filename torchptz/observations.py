@@ -223,14 +223,7 @@ class Observations(Batched):
         Raises:
             ValueError: not such a file, or one of a later version; names the file.
         """
-        arrays = read_arrays(path, "a file of observations")
-        version = arrays.pop("schema_version", None)
-        if version is None:
-            raise ValueError(f"{path}: not a file of observations (no schema_version)")
-        if not np.array_equal(version, SCHEMA_VERSION):
-            raise ValueError(
-                f"{path}: schema version {version}; this torchptz reads {SCHEMA_VERSION}"
-            )
+        arrays = read_arrays(path, "a file of observations", SCHEMA_VERSION)
         try:
             names = [str(name) for name in arrays.pop("camera")]
             stored = cls(names, **{name: torch.from_numpy(a) for name, a in arrays.items()})

@@ -175,14 +175,7 @@ class LinePatterns(Batched):
         Raises:
             ValueError: not such a file, or one of a later version; names the file.
         """
-        arrays = read_arrays(path, "a file of line patterns")
-        version = arrays.pop("schema_version", None)
-        if version is None:
-            raise ValueError(f"{path}: not a file of line patterns (no schema_version)")
-        if not np.array_equal(version, SCHEMA_VERSION):
-            raise ValueError(
-                f"{path}: schema version {version}; this torchptz reads {SCHEMA_VERSION}"
-            )
+        arrays = read_arrays(path, "a file of line patterns", SCHEMA_VERSION)
         try:
             patterns = cls(**{name: torch.from_numpy(value) for name, value in arrays.items()})
             beside = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,6 +19,25 @@ _SOLVED = 2e-13  # of the equation, in units of r: what counts as an answer
 # At the fold r L(r) is flat. So little before it the value is the same to the last digit, and an
 # answer that is rounded to a picture point stays on this side.
 _BEFORE_FOLD = 1 - 1e-9
+_MOST_FACTORS = 8  # that a power is multiplied up with
+
+
+def powers_of(radius: Tensor, exponents: Sequence[float]) -> Tensor:
+    """(..., K): powers of radii (...) > 0, with ascending exponents.
+
+    Whole ones are multiplied up: pow is slow.
+    """
+    columns, last, reached = [], None, 0.0
+    for exponent in exponents:
+        gap = exponent - reached
+        if gap.is_integer() and gap <= _MOST_FACTORS:
+            for _ in range(int(gap)):
+                last = radius if last is None else last * radius
+        else:
+            last = radius**exponent
+        columns.append(last)
+        reached = exponent
+    return torch.stack(columns, -1)
 
 
 @dataclass(frozen=True, eq=False)

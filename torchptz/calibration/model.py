@@ -19,9 +19,9 @@ from torchptz.batch import Batched
 from torchptz.calibration import parameters as at
 from torchptz.calibration.backlash import load_behind
 from torchptz.calibration.problem import Problem
+from torchptz.radial import powers_of
 
 _NEWTON_STEPS = 8
-_MOST_FACTORS = 4  # that a power is multiplied up with
 _SMALLEST_RADIUS = 1e-9  # units of r
 _LARGEST_RADIUS = 10.0
 _FLATTEST = 0.05  # of r L(r): behind its fold the lens has no inverse
@@ -92,7 +92,7 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     seen = problem.pixel - point - beside
     guess = torch.hypot(aspect * seen[..., 0], seen[..., 1]) * per_px
     radius = _radius(target, guess, coefficients, problem.powers)
-    monomials = _monomials(radius, problem.powers)
+    monomials = powers_of(radius, problem.powers.tolist())
     correction = 1 + (coefficients * monomials).sum(-1)
     # Behind the fold L may vanish.
     shrink = 1 / torch.where(correction.abs() < _FLATTEST, _FLATTEST, correction)
@@ -169,27 +169,13 @@ def _gather(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, index.unsqueeze(-1).expand(*index.shape, values.shape[-1]))
 
 
-def _monomials(radius: Tensor, powers: Tensor) -> Tensor:
-    """(C, N, K) powers of radii. Whole ones are multiplied up: pow is slow."""
-    columns, last, reached = [], None, 0.0
-    for power in powers.tolist():
-        gap = power - reached
-        if gap.is_integer() and gap <= _MOST_FACTORS:
-            for _ in range(int(gap)):
-                last = radius if last is None else last * radius
-        else:
-            last = radius**power
-        columns.append(last)
-        reached = power
-    return torch.stack(columns, -1)
-
-
 def _radius(target: Tensor, guess: Tensor, coefficients: Tensor, powers: Tensor) -> Tensor:
     """(C, N) the r with r L(r) = target, by Newton from a guess next to it."""
     radius = torch.where(guess > 0, guess, target).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     both = torch.stack([coefficients, coefficients * (powers + 1)], -1)  # (C, N, K, 2)
+    exponents = powers.tolist()
     for _ in range(_NEWTON_STEPS):
-        value, slope = (_monomials(radius, powers).unsqueeze(-1) * both).sum(-2).unbind(-1)
+        value, slope = (powers_of(radius, exponents).unsqueeze(-1) * both).sum(-2).unbind(-1)
         radius = radius - (radius * (1 + value) - target) / (1 + slope).clamp_min(_FLATTEST)
         radius = radius.clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     return radius

@@ -12,8 +12,8 @@ from torch import Tensor
 from torchptz.batch import Batched
 from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
+from torchptz.radial import powers_of
 
-_MOST_FACTORS = 8
 FEWEST_POINTS = 3  # of a line
 
 
@@ -182,18 +182,8 @@ class Problem(Batched):
         return torch.where(away.unsqueeze(-1), basis, 0.0)
 
     def basis(self, radius: Tensor) -> Tensor:
-        """(..., K): powers of a radius (...) > 0. Whole ones are multiplied up: pow is slow."""
-        columns, last, reached = [], None, 0.0
-        for exponent in self.exponents:
-            gap = exponent - reached
-            if gap.is_integer() and gap <= _MOST_FACTORS:
-                for _ in range(int(gap)):
-                    last = radius if last is None else last * radius
-            else:
-                last = radius**exponent
-            columns.append(last)
-            reached = exponent
-        return torch.stack(columns, -1)
+        """(..., K): powers of a radius (...) > 0."""
+        return powers_of(radius, self.exponents)
 
     def correct(self, center: Tensor, coefficients: Tensor, gain: Tensor | None = None) -> Tensor:
         """Undistorted points, moved onto their lines by ``gain`` times the known offsets.
