@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests import head_body
-from torchptz.calibration.problem import Problem
+from torchptz.calibration.problem import Problem, rows_of
 from torchptz.observations import Observations
 
 POWERS = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
@@ -58,9 +58,9 @@ class TestSums:
                 torch.testing.assert_close(sums[c, stop], own, rtol=0, atol=1e-12)
 
     @pytest.mark.parametrize("tail", [(), (2,), (2, 3)])
-    def test_of_stop_hands_them_out(self, problem, tail):
+    def test_rows_of_hands_them_out(self, problem, tail):
         values = torch.randn(2, problem.stops, *tail, dtype=torch.float64)
-        out = problem.of_stop(values)
+        out = rows_of(values, problem.stop)
         for c in range(2):
             torch.testing.assert_close(out[c], values[c][problem.stop[c]], rtol=0, atol=0)
 

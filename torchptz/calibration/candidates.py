@@ -12,7 +12,7 @@ from torchptz.batch import Batched
 from torchptz.calibration import parameters as at
 from torchptz.calibration.calibration import Calibration
 from torchptz.calibration.model import predict
-from torchptz.calibration.problem import Problem
+from torchptz.calibration.problem import Problem, rows_of
 from torchptz.geometry import pan_tilt_to_see, project, to_camera, wrap_angle
 
 PLACES = (17, 13)  # over the picture, where features are to be brought
@@ -88,7 +88,7 @@ class Views(Batched):
         """Views (C, n) of each camera."""
 
         names = [name for name in self.__dataclass_fields__ if name != "upwards"]
-        return replace(self, **{name: _of_look(getattr(self, name), index) for name in names})
+        return replace(self, **{name: rows_of(getattr(self, name), index) for name in names})
 
 
 def candidates(
@@ -217,16 +217,16 @@ def _seen(c: Calibration, views: Views, margin: Tensor) -> Views:
 def _ideal(c: Calibration, problem: Problem) -> Tensor:
     """(C, N, 2) px, where features are without distortion; NaN behind the camera."""
     pan, tilt = (problem.motor * c.axis_scale[:, None]).unbind(-1)
-    ray = _of_look(c.ray, problem.feature)
+    ray = rows_of(c.ray, problem.feature)
     x, y, z = to_camera(ray, pan, tilt + c.tilt_zero[:, None]).unbind(-1)
     roll, left = c.roll[:, None], c.boresight[:, None]
     x, z = torch.cos(left) * x + torch.sin(left) * z, torch.cos(left) * z - torch.sin(left) * x
     x, y = torch.cos(roll) * x - torch.sin(roll) * y, torch.sin(roll) * x + torch.cos(roll) * y
-    ahead = _of_look(c.pupil_m, problem.zoom) / _of_look(c.distance_m, problem.feature)
+    ahead = rows_of(c.pupil_m, problem.zoom) / rows_of(c.distance_m, problem.feature)
     image = project(torch.stack([x, y, z - ahead], -1))
     square = torch.stack([torch.ones_like(c.pixel_aspect), c.pixel_aspect], -1)[:, None]
-    focal = _of_look(c.focal_length, problem.zoom).unsqueeze(-1) * square
-    return _of_look(c.principal_point, problem.zoom) + focal * image
+    focal = rows_of(c.focal_length, problem.zoom).unsqueeze(-1) * square
+    return rows_of(c.principal_point, problem.zoom) + focal * image
 
 
 def _undistorted(c: Calibration, problem: Problem, pixel: Tensor) -> Tensor:
@@ -234,20 +234,13 @@ def _undistorted(c: Calibration, problem: Problem, pixel: Tensor) -> Tensor:
     fold = torch.full_like(c.zooms, math.nan)
     camera, zoom = c.pairs.unbind(1)
     fold[camera, zoom] = c.lens.valid_radius / c.lens.scale
-    away = pixel - _of_look(c.center, problem.zoom)
+    away = pixel - rows_of(c.center, problem.zoom)
     x, y = away.unbind(-1)
     radius = torch.hypot(c.pixel_aspect[:, None] * x, y) / problem.scale[:, None]
-    coefficients = _of_look(c.coefficients, problem.zoom)
+    coefficients = rows_of(c.coefficients, problem.zoom)
     stretch = (coefficients * radius.unsqueeze(-1) ** problem.powers).sum(-1, keepdim=True)
-    valid = (radius < _of_look(fold, problem.zoom)).unsqueeze(-1)
+    valid = (radius < rows_of(fold, problem.zoom)).unsqueeze(-1)
     return torch.where(valid, pixel + stretch * away, math.nan)
-
-
-def _of_look(values: Tensor, index: Tensor) -> Tensor:
-    """(C, N, ...) values (C, K, ...) of the zoom or feature (C, N) of each look."""
-    tail = values.shape[2:]
-    where = index.reshape(*index.shape, *[1] * len(tail)).expand(*index.shape, *tail)
-    return values.gather(1, where)
 
 
 def problem_of(calibration: Calibration, views: Views) -> tuple[Problem, Tensor]:

@@ -11,6 +11,7 @@ Nothing larger than 2 x 2 is inverted per stop, and S may be 0: a head that read
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -71,7 +72,7 @@ def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
     weight = torch.where(weight > 0, weight, 1.0)
     head = noise.head[:, None] / weight.unsqueeze(-1)  # (C, S, 2)
     system = information * head.unsqueeze(-2)
-    system = system + torch.eye(2).to(system)
+    system = system + _unit(system)
     answer = _inverse(system)
     return Metric(precision, by_pose, answer, information, head.unsqueeze(-1) * answer, weight)
 
@@ -115,7 +116,7 @@ def distances(problem: Problem, by_pose: Tensor, noise: Noise, residual: Tensor)
     """(C, N) squared standardised distance of every observation by itself, of weight or not."""
     variance = problem.sigma**2 * noise.pixel[:, None]
     covariance = _product(by_pose, noise.head[:, None, :, None] * by_pose.mT)
-    covariance = covariance + variance[..., None, None] * torch.eye(2).to(covariance)
+    covariance = covariance + variance[..., None, None] * _unit(covariance)
     away = residual.unsqueeze(-1)
     return (away * _product(_inverse(covariance), away)).sum((-2, -1))
 
@@ -177,7 +178,8 @@ def learned_noise(
     system = system + torch.diag_embed((-score).clamp_min(0))
     # Twice the logarithm of the priors' densities, as of the likelihood's.
     away = torch.cat([noise.head / assumed.head, (noise.pixel / assumed.pixel)[:, None]], 1).log()
-    spread = torch.tensor([_HEAD_FACTOR, _HEAD_FACTOR, _PIXEL_FACTOR]).to(away).log().mul(2)
+    spread = torch.full_like(away[0], 2 * math.log(_HEAD_FACTOR))
+    spread[2:] = 2 * math.log(_PIXEL_FACTOR)
     score = score - 2 * away / spread**2
     system = system + torch.diag(2 / spread**2)
     size = system.diagonal(dim1=1, dim2=2).clamp_min(1e-300).sqrt()
@@ -185,6 +187,11 @@ def learned_noise(
     step = torch.linalg.solve_ex(system, (score / size).unsqueeze(-1)).result.squeeze(-1) / size
     factor = step.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST).exp()
     return Noise(noise.head * factor[:, :2], noise.pixel * factor[:, 2])
+
+
+def _unit(like: Tensor) -> Tensor:
+    """(2, 2), made where it is needed: a copy there would be waited for."""
+    return torch.eye(2, dtype=like.dtype, device=like.device)
 
 
 def _product(matrix: Tensor, columns: Tensor) -> Tensor:

@@ -178,6 +178,8 @@ def _with_more_powers(
 
     # As vague about them as about the others.
     vague = problem.layout.split(known.sigma)[0][..., at.COEFFICIENTS, None]
-    rich = replace(problem, layout=layout, powers=torch.tensor(powers).to(problem.powers))
+    rich = replace(
+        problem, layout=layout, powers=torch.tensor(powers).to(problem.powers), exponents=None
+    )
     priors = Known(embedded(known.mean, 0.0), embedded(known.sigma, vague))
     return rich, embedded(theta, 0.0), priors, [0, 1, *(2 + powers.index(p) for p in own)]

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchptz.batch import Batched
 from torchptz.calibration import parameters as at
 from torchptz.calibration.backlash import load_behind
-from torchptz.calibration.problem import Problem
+from torchptz.calibration.problem import Problem, rows_of
 from torchptz.radial import powers_of
 
 _NEWTON_STEPS = 8
@@ -50,8 +50,8 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     """
     layout = problem.layout
     zooms, head, features = layout.split(theta)
-    zoom = _gather(zooms, problem.zoom)  # (C, N, per_zoom)
-    ray_pan, ray_tilt, nearness = _gather(features, problem.feature).unbind(-1)
+    zoom = rows_of(zooms, problem.zoom)  # (C, N, per_zoom)
+    ray_pan, ray_tilt, nearness = rows_of(features, problem.feature).unbind(-1)
     head = head[:, None]
     tilt_zero, boresight, roll = (head[..., i] for i in (at.TILT_ZERO, at.BORESIGHT, at.ROLL))
     scale = head[..., at.AXIS_SCALE]
@@ -91,8 +91,8 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     target = (torch.hypot(aspect * to_x, to_y) * per_px).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     seen = problem.pixel - point - beside
     guess = torch.hypot(aspect * seen[..., 0], seen[..., 1]) * per_px
-    radius = _radius(target, guess, coefficients, problem.powers)
-    monomials = powers_of(radius, problem.powers.tolist())
+    radius = _radius(problem, target, guess, coefficients)
+    monomials = powers_of(radius, problem.exponents)
     correction = 1 + (coefficients * monomials).sum(-1)
     # Behind the fold L may vanish.
     shrink = 1 / torch.where(correction.abs() < _FLATTEST, _FLATTEST, correction)
@@ -164,18 +164,14 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     return Prediction(pixel, torch.stack(columns, -1), by_pose)
 
 
-def _gather(values: Tensor, index: Tensor) -> Tensor:
-    """(C, N, M) rows of (C, K, M)."""
-    return values.gather(1, index.unsqueeze(-1).expand(*index.shape, values.shape[-1]))
-
-
-def _radius(target: Tensor, guess: Tensor, coefficients: Tensor, powers: Tensor) -> Tensor:
+def _radius(problem: Problem, target: Tensor, guess: Tensor, coefficients: Tensor) -> Tensor:
     """(C, N) the r with r L(r) = target, by Newton from a guess next to it."""
     radius = torch.where(guess > 0, guess, target).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
-    both = torch.stack([coefficients, coefficients * (powers + 1)], -1)  # (C, N, K, 2)
-    exponents = powers.tolist()
+    both = torch.stack([coefficients, coefficients * (problem.powers + 1)], -1)  # (C, N, K, 2)
     for _ in range(_NEWTON_STEPS):
-        value, slope = (powers_of(radius, exponents).unsqueeze(-1) * both).sum(-2).unbind(-1)
+        value, slope = (
+            (powers_of(radius, problem.exponents).unsqueeze(-1) * both).sum(-2).unbind(-1)
+        )
         radius = radius - (radius * (1 + value) - target) / (1 + slope).clamp_min(_FLATTEST)
         radius = radius.clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
     return radius

@@ -33,7 +33,14 @@ class Problem(Batched):
     scale: Tensor  # (C,) px per unit of r
     image_size: Tensor  # (C, 2) px
 
-    _shared: ClassVar[frozenset[str]] = frozenset({"layout", "stops", "powers"})
+    exponents: tuple[float, ...] | None = None  # the powers as plain numbers; None: of them
+
+    _shared: ClassVar[frozenset[str]] = frozenset({"layout", "stops", "powers", "exponents"})
+
+    def __post_init__(self) -> None:
+        # Once: every look at numbers of a device waits for it.
+        if self.exponents is None:
+            object.__setattr__(self, "exponents", tuple(self.powers.tolist()))
 
     @classmethod
     def from_observations(cls, observations: Observations, powers: Tensor) -> Problem:
@@ -77,11 +84,12 @@ class Problem(Batched):
         where = self.stop.reshape(*self.stop.shape, *[1] * len(tail)).expand_as(values)
         return values.new_zeros(len(values), self.stops, *tail).scatter_add(1, where, values)
 
-    def of_stop(self, values: Tensor) -> Tensor:
-        """(C, N, ...) values (C, S, ...) of the stop of each observation."""
-        tail = values.shape[2:]
-        where = self.stop.reshape(*self.stop.shape, *[1] * len(tail))
-        return values.gather(1, where.expand(*self.stop.shape, *tail))
+
+def rows_of(values: Tensor, index: Tensor) -> Tensor:
+    """(C, N, ...) rows of values (C, K, ...), such as those of the zoom (C, N) of every look."""
+    tail = values.shape[2:]
+    where = index.reshape(*index.shape, *[1] * len(tail)).expand(*index.shape, *tail)
+    return values.gather(1, where)
 
 
 def _motor(o: Observations) -> Tensor:

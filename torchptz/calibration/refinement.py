@@ -285,7 +285,7 @@ def _solve(matrix: Tensor, right: Tensor, damping: Tensor) -> Tensor:
 def inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Inverse (C, T, T) of positive definite matrices, and where there is none (C,)."""
     finite = matrix.isfinite().all((1, 2))
-    identity = torch.eye(matrix.shape[-1]).to(matrix)
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     matrix = torch.where(finite[:, None, None], matrix, identity)
     scaled, size = _scaled(matrix)
     factor, failed = torch.linalg.cholesky_ex(scaled)
