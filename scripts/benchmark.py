@@ -1,10 +1,11 @@
 """What the project promises in figures, measured: numbers and time, which no test is for.
 
-`benchmark.py accuracy --json FILE` measures how accurate the estimator is, `benchmark.py head` what
-the complete calibration makes of imperfect heads, each section by section (the modules of
-`accuracy` and `head`). The exit code is 0 only if every check holds: 1 if one does not or a section
-failed, 2 if the command was called wrongly, 130 if it was interrupted. What was measured until then
-is in the file.
+`benchmark.py accuracy --json FILE` measures how accurate the estimator is, `head` what the complete
+calibration makes of imperfect heads, `estimate` and `rectify` how fast both are beside other
+programs, each section by section (the modules of the packages of those names). The exit code is 0
+only if every check holds: 1 if one does not or a section failed, 2 if the command was called
+wrongly, 130 if it was interrupted. What was measured until then is in the file.
+`benchmark.py readme --json FILE ...` puts the tables of such files into the README.
 """
 
 from __future__ import annotations
@@ -13,18 +14,18 @@ import importlib
 import inspect
 import json
 import os
-import platform
 import sys
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import ModuleType
 
 import click
+import readme_tables
 import torch
+from machine import environment, in_words
 
 from torchptz.files import without_nan, write_whole
 
@@ -34,11 +35,9 @@ SECTIONS = {
         "convergence",
     ),
     "head": ("imperfections", "views"),
+    "estimate": ("patterns", "scaling", "ragged", "loop", "resident", "complete"),
+    "rectify": ("frames", "tensors", "maps", "folder"),
 }
-_PACKAGES = (
-    *("torchptz", "torch", "numpy", "scipy", "opencv-python-headless", "kornia"),
-    *("lensfunpy", "discorpy", "hypothesis"),
-)
 _ROOT = Path(__file__).resolve().parents[1]
 _FILE = click.Path(dir_okay=False, path_type=Path)
 
@@ -68,6 +67,7 @@ class Section:
             "holds": self.holds,
             "error": self.error,
             "checks": self.checks,
+            "table": self.table,
             "figures": self.figures,
         }
 
@@ -132,6 +132,48 @@ def accuracy(**options: object) -> None:
 def head(**options: object) -> None:
     """Measure what the complete calibration makes of imperfect heads, and check it."""
     _measure("head", **options)
+
+
+@main.command()
+@_options("estimate")
+def estimate(**options: object) -> None:
+    """Measure how fast lenses are estimated, beside other programs to the same accuracy."""
+    _measure("estimate", **options)
+
+
+@main.command()
+@_options("rectify")
+def rectify(**options: object) -> None:
+    """Measure how fast pictures are rectified, beside other programs."""
+    _measure("rectify", **options)
+
+
+@main.command()
+@click.option(
+    "--json",
+    "json_paths",
+    type=_FILE,
+    multiple=True,
+    required=True,
+    help="File of figures; can be repeated.",
+)
+@click.option(
+    "--readme",
+    "readme_path",
+    type=_FILE,
+    default=_ROOT / "README.md",
+    help="The text with the markers; default the project's README.",
+)
+def readme(json_paths: tuple[Path, ...], readme_path: Path) -> None:
+    """Put the tables of files of figures into the README, between its markers."""
+    try:
+        text = readme_path.read_text(encoding="utf-8")
+        reports = [readme_tables.load(path) for path in json_paths]
+        written = readme_tables.with_blocks(text, reports)
+        write_whole(readme_path, written)
+    except (ValueError, OSError) as error:
+        raise click.ClickException(str(error)) from error
+    click.echo(f"{', '.join(one['command'] for one in reports)}: written into {readme_path.name}")
 
 
 def _measure(
@@ -212,28 +254,8 @@ def run_section(command: str, name: str, quick: bool, device: str = "cpu") -> Se
     return section
 
 
-def environment() -> dict:
-    """Versions and kind of machine, neither its name nor its folders."""
-    return {
-        "python": platform.python_version(),
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "cpus": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
-        "versions": {name: _version(name) for name in _PACKAGES},
-    }
-
-
 def _load(command: str, name: str) -> ModuleType:
     return importlib.import_module(f"{command}.{name}")
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _write(
@@ -246,13 +268,8 @@ def _write(
     write_whole(path, json.dumps(without_nan(report), indent=2, allow_nan=False) + "\n")
     if markdown is not None:
         quick = " (quick)" if report["quick"] else ""
-        versions = ", ".join(f"{k} {v}" for k, v in report["environment"]["versions"].items() if v)
-        environment = report["environment"]
         heading = (
-            f"# {report['command'].capitalize()}{quick}\n\n"
-            f"{environment['system']} {environment['machine']}, "
-            f"{environment['cpus']} CPUs, {environment['threads']} threads; "
-            f"Python {environment['python']}, {versions}\n\n"
+            f"# {report['command'].capitalize()}{quick}\n\n{in_words(report['environment'])}\n\n"
         )
         write_whole(markdown, heading + "\n".join(one.as_markdown() for one in done))
 

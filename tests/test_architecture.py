@@ -11,18 +11,9 @@ import torchptz
 
 ROOT = Path(torchptz.__file__).parent
 CORE = (
-    *("batch", "calibration", "displacement", "estimation", "files", "geometry", "intrinsics"),
-    *(
-        "lens",
-        "observations",
-        "patterns",
-        "radial",
-        "rectangle",
-        "rectification",
-        "zoom_interpolation",
-        "zoom_knot",
-    ),
-    *("zoom_table", "zoom_table_file"),
+    *("batch", "calibration", "compiled", "displacement", "estimation", "files", "geometry"),
+    *("intrinsics", "kernels", "lens", "observations", "patterns", "radial", "rectification"),
+    *("zoom_interpolation", "zoom_knot", "zoom_table", "zoom_table_file"),
 )
 EDGE = ("cameras", "cli", "export", "fleet", "report", "scanning", "simulation")
 PUBLIC = (

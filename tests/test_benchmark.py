@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
@@ -155,9 +156,80 @@ class TestFront:
 
     def test_says_what_it_ran_on_but_not_where(self, call):
         environment = call({"one": section()})[1]["environment"]
-        assert environment["threads"] == torch.get_num_threads()
+        assert environment["threads"]["torch"] == torch.get_num_threads()
         assert environment["versions"]["torch"] == torch.__version__
+        assert environment["versions"]["numpy"] == np.__version__
+        assert environment["memory_gib"] > 0
+        assert environment["cpus"] >= 1
         assert str(SCRIPTS.parent) not in json.dumps(environment)
+
+
+class TestReadme:
+    TEXT = "before\n<!-- benchmark accuracy -->\nold\n<!-- end of benchmark accuracy -->\nafter\n"
+
+    @pytest.fixture
+    def put(self, call, benchmark, tmp_path):
+        """Measure sections, put their tables into a text; exit code, the text, output."""
+
+        def run(sections, *arguments, text=self.TEXT, again=1):
+            call(sections, *arguments)
+            readme = tmp_path / "README.md"
+            readme.write_text(text, encoding="utf-8")
+            figures, to = str(tmp_path / "report.json"), str(readme)
+            for _ in range(again):
+                result = CliRunner().invoke(
+                    benchmark.main, ["readme", "--json", figures, "--readme", to]
+                )
+            return result.exit_code, readme.read_text(encoding="utf-8"), result.output
+
+        return run
+
+    def test_puts_every_table_between_the_markers(self, put):
+        code, text, _ = put({"one": section(), "two": section(title="Another")})
+        assert code == 0
+        assert "old" not in text
+        assert text.startswith("before\n<!-- benchmark accuracy -->\n\n**A section**\n\n| value |")
+        assert text.endswith("\n\n<!-- end of benchmark accuracy -->\nafter\n")
+        assert text.index("**A section**") < text.index("**Another**")
+        assert f"torch {torch.__version__}" in text
+
+    def test_once_more_changes_nothing(self, put):
+        once = put({"one": section()})[1].partition("Measured on")[0]
+        assert put({"one": section()}, again=2)[1].partition("Measured on")[0] == once
+
+    def test_says_which_promises_were_missed(self, put):
+        _, text, _ = put({"one": section({"held": True, "too slow": False})})
+        assert "Missed: too slow." in text
+        assert "held" not in text
+
+    @pytest.mark.parametrize(
+        ("sections", "arguments", "text", "reason"),
+        [
+            ({"one": section()}, ("--quick",), TEXT, "quick"),
+            ({"one": section(run=fail)}, (), TEXT, "no such thing"),
+            ({"one": section(), "two": section(run=interrupt)}, (), TEXT, "interrupted"),
+            ({"one": section()}, (), "no markers", "<!-- benchmark accuracy -->"),
+            ({"one": section()}, (), TEXT + TEXT, "once"),
+            (
+                {"one": section()},
+                (),
+                "<!-- end of benchmark accuracy --><!-- benchmark accuracy -->",
+                "before",
+            ),
+        ],
+    )
+    def test_leaves_the_text_alone(self, put, sections, arguments, text, reason):
+        code, after, output = put(sections, *arguments, text=text)
+        assert (code, after) == (1, text)
+        assert reason in output
+
+    def test_a_file_without_figures(self, benchmark, tmp_path):
+        for content in ("[]", "{}", "not JSON"):
+            (tmp_path / "figures.json").write_text(content)
+            arguments = ["readme", "--json", str(tmp_path / "figures.json")]
+            result = CliRunner().invoke(benchmark.main, arguments)
+            assert result.exit_code == 1
+            assert "figures.json" in result.output
 
 
 def brute_force(lens: RadialLens, pattern: LinePatterns, sigma: float, gain: float | None):

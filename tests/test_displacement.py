@@ -8,7 +8,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchptz.displacement import picture_grid, undistort_jacobian
+from torchptz.displacement import (
+    displacement_sigma,
+    picture_grid,
+    reference_sigma,
+    undistort_jacobian,
+)
 from torchptz.lens import RadialLens
 from torchptz.simulation.comparison import apply_homography, fit_homography
 
@@ -208,3 +213,101 @@ class TestTheUnknown:
         for part in ("all", "lines", "homography"):
             found = lens.displacement_sigma(self.points, covariance, part)
             assert found.isnan().tolist() == [[False, True, False], [True] * 3]
+
+
+PARTS = ("all", "lines", "homography")
+SOME_POWERS = [(1, 2, 3), (2,), (2, 4, 6), (0.5, 1.7, 3), (1, 2, 3, 4, 5), (1, 12)]
+
+
+def assert_same(lens, points, covariance, part, rtol=1e-9):
+    """The kernel's answer and the reference's."""
+    found = displacement_sigma(lens, points, covariance, part)
+    expected = reference_sigma(lens, points, covariance, part)
+    for one, other in zip(found, expected, strict=True):
+        finite = other[other.isfinite()]
+        # What a part leaves of a whole is as exact as the whole.
+        largest = float(finite.max()) if len(finite) else 0.0
+        torch.testing.assert_close(one, other, rtol=rtol, atol=rtol * largest, equal_nan=True)
+
+
+class TestKernel:
+    @given(
+        powers=st.sampled_from(SOME_POWERS),
+        size=st.floats(0, 0.3),
+        aspect=st.floats(0.8, 1.25),
+        center=st.tuples(st.floats(100, 540), st.floats(50, 430)),
+        shared=st.booleans(),
+        seed=st.integers(0, 999),
+    )
+    @settings(max_examples=60, deadline=None)
+    def test_is_the_reference(self, powers, size, aspect, center, shared, seed):
+        rng = np.random.default_rng(seed)
+        coefficients = rng.uniform(-size, size, (3, len(powers)))
+        lens = RadialLens([list(center)] * 3, coefficients, powers, None, SIZE, aspect)
+        points = torch.from_numpy(rng.uniform(-50, 700, (1 if shared else 3, 2, 4, 2)))
+        covariance = some_covariance(1 if shared else 3, 2 + len(powers), seed)
+        for part in PARTS:
+            assert_same(lens, points, covariance, part, rtol=1e-7)
+
+    @pytest.mark.parametrize("part", PARTS)
+    @pytest.mark.parametrize(
+        ("coefficients", "powers"),
+        [
+            ([-0.6], (2,)),  # folds inside the picture
+            ([-100.0], (2,)),  # at 18 px: a few places of the grid
+            ([-1000.0], (2,)),  # at 6 px: none
+            ([-2.0, -100.0], (1, 2)),
+            ([-1 + 1e-9], (1e-9,)),  # maps all to next to a point
+            ([math.nan], (2,)),
+            ([math.inf], (2,)),
+            ([1e50, 1e77], (2, 3)),  # moments that are no numbers
+            ([1e160], (2,)),  # errors that are none
+            ([1e305], (2,)),  # places that are none
+        ],
+    )
+    @pytest.mark.parametrize("center", [(310.0, 250.0), (-400.0, 200.0), (math.nan, 1.0)])
+    def test_lenses_that_are_none(self, part, coefficients, powers, center):
+        lens = RadialLens([list(center)], [coefficients], powers, None, SIZE)
+        points = torch.cat([picture_grid(lens)[:, ::29], double([[[310, 250], [311, 252]]])], 1)
+        known = some_covariance(1, 2 + len(powers))
+        unknown, nothing = known.clone(), known.clone()
+        unknown[:, -1, -1] = math.inf
+        nothing[:, 0] = math.nan
+        for covariance in (known, unknown, nothing, 1e300 * known, 0 * known):
+            assert_same(lens, points, covariance, part, rtol=1e-6)
+
+    @pytest.mark.parametrize("part", PARTS)
+    def test_bad_lenses_change_nobody_else(self, part):
+        center = [[310.0, 250.0]] * 6
+        values = [[-0.6, 0], [math.nan, 0], [0.1, 0.02], [-1000.0, 0], [0, 0], [1e160, 0]]
+        lens = RadialLens(center, values, (2, 4), None, SIZE)
+        covariance = some_covariance(6, 4)
+        covariance[4, 0, 0] = math.inf
+        points = torch.from_numpy(np.random.default_rng(0).uniform(0, 479, (6, 9, 2)))
+        together = lens.displacement_sigma(points, covariance, part)
+        for i in range(6):
+            alone = lens[i].displacement_sigma(points[i : i + 1], covariance[i : i + 1], part)
+            torch.testing.assert_close(together[i : i + 1], alone, rtol=0, atol=0, equal_nan=True)
+        assert bool(together[2].isfinite().all())
+
+    def test_inside_means_the_same_to_the_last_digit(self):
+        lens = RadialLens([[310.3, 250.7]], [[-0.6]], (2,), None, SIZE, 1.1)
+        angles = torch.linspace(0, 7, 5001, dtype=torch.float64)
+        ring = torch.stack([angles.cos() / 1.1, angles.sin()], -1)
+        points = lens.center + float(lens.valid_radius) * ring[None]
+        found = lens.displacement_sigma(points, some_covariance(1, 3)).isnan()
+        assert torch.equal(~found, lens.is_valid(points))
+        assert 500 < int(found.sum()) < 4500
+
+    @pytest.mark.parametrize("part", PARTS)
+    def test_derivatives_are_those_of_the_reference(self, part):
+        covariance = some_covariance(1, 5).requires_grad_()
+        points = double([[[100.0, 90.0], [320.0, 50.0]]])
+
+        def sigma(covariance):
+            return barrel()[:1].displacement_sigma(points, covariance, part)
+
+        assert torch.autograd.gradcheck(sigma, covariance, eps=1e-9, atol=1e-4, rtol=1e-4)
+        by_transform = torch.func.jacrev(sigma)(covariance.detach())
+        expected = torch.autograd.functional.jacobian(sigma, covariance)
+        torch.testing.assert_close(by_transform, expected)

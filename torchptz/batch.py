@@ -30,7 +30,7 @@ class Batched:
     def __getitem__(self, index: int | slice | Tensor) -> Self:
         """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``.
 
-        A one-dimensional tensor of indices takes those items, where no field is a list.
+        A one-dimensional tensor of indices takes those items.
         """
         if not isinstance(index, slice | Tensor):
             index = operator.index(index)
@@ -38,8 +38,14 @@ class Batched:
                 raise IndexError(f"item {index} of a batch of {len(self)}")
             index %= len(self)
             index = slice(index, index + 1)
+
+        def taken(value: Tensor | Batched | list) -> Tensor | Batched | list:
+            if isinstance(value, list) and isinstance(index, Tensor):
+                return [value[i] for i in index.tolist()]
+            return value[index]
+
         changed = {
-            field.name: getattr(self, field.name)[index]
+            field.name: taken(getattr(self, field.name))
             for field in fields(self)
             if field.name not in self._shared and getattr(self, field.name) is not None
         }

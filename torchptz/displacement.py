@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 import torch
 from torch import Tensor
 
+from torchptz.compiled import arrays, in_reach_of_kernels, run
+
 if TYPE_CHECKING:
     from torchptz.lens import RadialLens
 
@@ -34,6 +36,20 @@ def displacement_sigma(
         raise ValueError(
             f"covariance must have shape {(batch, count, count)}, not {tuple(covariance.shape)}"
         )
+    given = points.to(torch.float64)
+    inputs = (lens.center, lens.coefficients, lens.scale, lens.pixel_aspect, given, covariance)
+    differentiate = torch.is_grad_enabled() and any(one.requires_grad for one in inputs)
+    if differentiate or not in_reach_of_kernels(*inputs):
+        sigma = reference_sigma(lens, given, covariance, part)
+    else:
+        sigma = _by_kernel(lens, given, covariance, part)
+    return sigma.to(points.dtype) if points.is_floating_point() else sigma
+
+
+def reference_sigma(
+    lens: RadialLens, points: Tensor, covariance: Tensor, part: Part = "all"
+) -> Tensor:
+    """`displacement_sigma` in plain torch, differentiable, for points in float64."""
     inside = lens.is_valid(points)
     flat = points.reshape(len(points), math.prod(points.shape[1:-1]), 2)
     jacobian = undistort_jacobian(lens, flat)
@@ -41,8 +57,41 @@ def displacement_sigma(
         fitted = _times(homography_fields(lens, flat), _homography_of_errors(lens))
         jacobian = fitted if part == "homography" else jacobian - fitted
     sigma = _trace(jacobian, covariance).clamp_min(0).sqrt().reshape(inside.shape)
-    sigma = torch.where(inside, sigma, math.nan)
-    return sigma.to(points.dtype) if points.is_floating_point() else sigma
+    return torch.where(inside, sigma, math.nan)
+
+
+def _by_kernel(lens: RadialLens, points: Tensor, covariance: Tensor, part: Part) -> Tensor:
+    """`reference_sigma` by a kernel, but for lenses whose homographies are not determined."""
+    from torchptz.kernels import displacement as kernels
+
+    lens.check_points(points)
+    shape = (len(lens), *points.shape[1:-1])
+    flat = points.reshape(len(points), math.prod(shape[1:]), 2)
+    share = torch.full((2, kernels.GRID_ROOM), math.nan, dtype=torch.float64)
+    places = _grid_shares()
+    share[:, : len(places)] = places.T
+    sigma = torch.empty(len(lens), flat.shape[1], dtype=torch.float64)
+    known = torch.empty(len(lens), dtype=torch.bool)
+    lenses = kernels.Lenses(
+        *arrays(
+            *(lens.center, lens.coefficients, lens.powers, lens.scale, lens.pixel_aspect),
+            *(lens.image_size, lens.fold),
+        )
+    )
+    run(
+        kernels.sigma,
+        len(lens),
+        lenses,
+        *arrays(share, flat, covariance),
+        part != "homography",
+        part != "lines",
+        *arrays(sigma, known),
+    )
+    rows = (~known).nonzero()[:, 0]
+    if len(rows):
+        where = [one[rows] if len(one) > 1 else one for one in (flat, covariance)]
+        sigma[rows] = reference_sigma(lens[rows], *where, part)
+    return sigma.reshape(shape)
 
 
 def undistort_jacobian(lens: RadialLens, points: Tensor) -> Tensor:
@@ -96,9 +145,13 @@ def homography_fields(lens: RadialLens, points: Tensor) -> Tensor:
 
 def picture_grid(lens: RadialLens) -> Tensor:
     """(B, 300, 2) px, evenly over each picture."""
+    return _grid_shares().to(lens.center.device) * lens.image_size[:, None] - 0.5
+
+
+def _grid_shares() -> Tensor:
+    """(300, 2) from 0 to 1 over a picture's sides."""
     axes = [(torch.arange(n, dtype=torch.float64) + 0.5) / n for n in _GRID]
-    share = torch.cartesian_prod(*axes).to(lens.center.device)
-    return share * lens.image_size[:, None] - 0.5
+    return torch.cartesian_prod(*axes)
 
 
 def _homography_of_errors(lens: RadialLens) -> Tensor:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -32,9 +33,10 @@ def checked_powers(powers: Sequence[float] | Tensor) -> Tensor:
     checked = torch.as_tensor(powers, dtype=torch.float64)
     if checked.ndim != 1 or checked.numel() == 0:
         raise ValueError(f"powers must be a list of at least one number, not {powers}")
-    if not bool((checked > 0).all() and (checked.diff() > 0).all()):
+    plain = checked.tolist()
+    if not all(low < high for low, high in pairwise([0.0, *plain])):
         raise ValueError(f"powers must be positive and increasing numbers, not {powers}")
-    if not bool((checked <= _HIGHEST_POWER).all()):
+    if not plain[-1] <= _HIGHEST_POWER:
         raise ValueError(f"powers must be at most {_HIGHEST_POWER:g}, not {powers}")
     return checked
 
@@ -89,7 +91,7 @@ class RadialLens(Batched):
         image_size = as_batch(self.image_size, "image_size", (2,))
         scale = image_size[:, 0] / 2 if self.scale is None else as_batch(self.scale, "scale", ())
         aspect = as_batch(self.pixel_aspect, "pixel_aspect", ())
-        if not bool((scale > 0).all()) or not bool((aspect > 0).all()):
+        if not bool(((scale > 0) & (aspect > 0)).all()):
             raise ValueError("scale and pixel_aspect must be positive")
         coefficients = as_batch(self.coefficients, "coefficients", (powers.numel(),))
         for name, value in {
@@ -114,11 +116,11 @@ class RadialLens(Batched):
             coefficients.
         """
         offset = self._from_center(points)
-        correction = self._radial.value(self.radius(points)).unsqueeze(-1)
+        radius = self._norm(offset, points) / self._per_item(self.scale, points)
+        inside = radius <= self._per_item(self.fold, points)
+        correction = self._radial.value(radius).unsqueeze(-1)
         undistorted = self._per_item(self.center, points) + correction * offset
-        nowhere = torch.full_like(undistorted, math.nan)
-        inside = self.is_valid(points).unsqueeze(-1)
-        return _as_given(torch.where(inside, undistorted, nowhere), points)
+        return _as_given(torch.where(inside.unsqueeze(-1), undistorted, math.nan), points)
 
     def distort(self, points: Tensor) -> Tensor:
         """Undistorted to picture points, the inverse of `undistort`.
@@ -154,8 +156,7 @@ class RadialLens(Batched):
             radius = radius + (error - error.detach()) / slope
         correction = self._radial.value(radius).unsqueeze(-1)
         distorted = self._per_item(self.center, points) + offset / correction
-        nowhere = torch.full_like(distorted, math.nan)
-        distorted = torch.where(converged.unsqueeze(-1), distorted, nowhere)
+        distorted = torch.where(converged.unsqueeze(-1), distorted, math.nan)
         return _as_given(distorted, points), converged
 
     @cached_property
@@ -164,7 +165,12 @@ class RadialLens(Batched):
 
         NaN for coefficients that are not finite: such a lens holds nowhere.
         """
-        return self._radial.fold * self.scale
+        return self.fold * self.scale
+
+    @property
+    def fold(self) -> Tensor:
+        """(B,) as `valid_radius`, in units of r."""
+        return self._radial.fold
 
     def radius(self, points: Tensor) -> Tensor:
         """(B, ...) distance of picture points (B, ..., 2) from the centre, in units of r."""
@@ -172,7 +178,7 @@ class RadialLens(Batched):
 
     def is_valid(self, points: Tensor) -> Tensor:
         """(B, ...) bool, whether picture points (B, ..., 2) lie within `valid_radius`."""
-        return self.radius(points) <= self._per_item(self._radial.fold, points)
+        return self.radius(points) <= self._per_item(self.fold, points)
 
     def displacement_sigma(self, points: Tensor, covariance: Tensor, part: Part = "all") -> Tensor:
         """Root-mean-square length of the error that `undistort` makes.
@@ -261,11 +267,15 @@ class RadialLens(Batched):
         inner = points.ndim - 2
         return value.reshape(value.shape[0], *([1] * inner), *value.shape[1:])
 
-    def _from_center(self, points: Tensor) -> Tensor:
+    def check_points(self, points: Tensor) -> None:
+        """Raise ValueError where points are not of shape (B or 1, ..., 2)."""
         if points.ndim < 2 or points.shape[-1] != 2 or points.shape[0] not in {1, len(self)}:
             raise ValueError(
                 f"points must have shape ({len(self)} or 1, ..., 2), not {tuple(points.shape)}"
             )
+
+    def _from_center(self, points: Tensor) -> Tensor:
+        self.check_points(points)
         return points.to(torch.float64) - self._per_item(self.center, points)
 
     def _norm(self, offset: Tensor, points: Tensor) -> Tensor:

@@ -122,6 +122,16 @@ class LinePatterns(Batched):
         """The points as B lists of (n, 2) arrays, empty lines left out."""
         return _lists(self.points, self.mask)
 
+    def trimmed(self, lines: int, places: int) -> LinePatterns:
+        """The first lines of each pattern, and of each the first places."""
+        kept = (slice(None), slice(lines), slice(places))
+        cut = {
+            name: getattr(self, name)[kept]
+            for name in ("points", "mask", *_BESIDE)
+            if getattr(self, name) is not None
+        }
+        return replace(self, **cut)
+
     def without_offsets(self) -> LinePatterns:
         """The same batch as if nothing were known of where the head truly stopped."""
         return replace(self, offsets=None)

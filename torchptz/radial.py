@@ -10,6 +10,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from torchptz.compiled import arrays, in_reach_of_kernels, run
+
 # A fold farther out than this many units of r is outside every picture and counts as none.
 _FARTHEST = 1e4
 _BISECTIONS = 80
@@ -69,11 +71,14 @@ class RadialFunction:
         NaN for coefficients that are not finite: such a lens holds nowhere.
         """
         with torch.no_grad():
-            one = self.coefficients.new_ones(len(self.coefficients), 1)
-            terms = torch.cat([one, self.coefficients * (self.powers + 1)], 1)
-            exponents = torch.cat([self.powers.new_zeros(1), self.powers])
-            first = positive_roots(terms, exponents)[:, 0]
-            return torch.where(terms.isfinite().all(1), first, math.nan)
+            if not in_reach_of_kernels(self.coefficients, self.powers):
+                return first_fold(self.coefficients, self.powers)
+            from torchptz.kernels import radial as kernels
+
+            folds = torch.empty(len(self.coefficients), dtype=torch.float64)
+            given = arrays(self.coefficients, self.powers)
+            run(kernels.fold, len(folds), *given, _FARTHEST, folds.numpy())
+            return folds
 
     @torch.no_grad()
     def inverse(self, target: Tensor) -> tuple[Tensor, Tensor]:
@@ -95,7 +100,8 @@ class RadialFunction:
         radius, step = torch.minimum(target, farthest), high - low
         before = step
         settled = ~reachable
-        for _ in range(_NEWTON_STEPS):
+        between = _steps_between_looks(target.device)
+        for taken in range(1, _NEWTON_STEPS + 1):
             excess = radius * self.value(radius) - target
             settled |= excess.abs() <= _SETTLED * (1 + target)
             low = torch.where(excess <= 0, radius, low)
@@ -109,7 +115,7 @@ class RadialFunction:
             # A settled point is left alone, so that it does not depend on its neighbours.
             radius = torch.where(settled, radius, following)
             settled |= step <= _SETTLED * (1 + radius)
-            if bool(settled.all()):
+            if taken % between == 0 and bool(settled.all()):
                 break
         # Newton's last step is at rounding level unless it is still hunting near the fold, where
         # bisection has closed the bracket.
@@ -134,6 +140,20 @@ class RadialFunction:
         return 1 + torch.where(away, total, 0.0)
 
 
+def _steps_between_looks(device: torch.device) -> int:
+    """Newton's steps before it is asked whether all points have settled: elsewhere than on a CPU,
+    the answer has to be waited for."""
+    return 1 if device.type == "cpu" else 8
+
+
+def first_fold(coefficients: Tensor, powers: Tensor) -> Tensor:
+    """(B,) as `RadialFunction.fold`, of coefficients (B, K): the reference of its kernel."""
+    one = coefficients.new_ones(len(coefficients), 1)
+    terms = torch.cat([one, coefficients * (powers + 1)], 1)
+    exponents = torch.cat([powers.new_zeros(1), powers])
+    return torch.where(terms.isfinite().all(1), positive_roots(terms, exponents)[:, 0], math.nan)
+
+
 def positive_roots(terms: Tensor, exponents: Tensor) -> Tensor:
     """Positive roots of ``sum_k terms[k] r^exponents[k]``, for any real increasing exponents.
 
@@ -145,21 +165,26 @@ def positive_roots(terms: Tensor, exponents: Tensor) -> Tensor:
         exponents: (M,) increasing, the first one 0.
 
     Returns:
-        (B, max(M - 1, 1)), ascending, inf where there are fewer.
+        (B, M), ascending, inf where there are fewer.
     """
     batch, count = terms.shape
     if count == 1:
         return terms.new_full((batch, 1), math.inf)
-    turning = positive_roots(terms[:, 1:] * exponents[1:], exponents[1:] - exponents[1])
+    # Its scale does not matter; of the largest coefficients it would be infinite.
+    turning = positive_roots(
+        terms[:, 1:] * (exponents[1:] / exponents[-1]), exponents[1:] - exponents[1]
+    )
     knots = torch.cat(
         [terms.new_zeros(batch, 1), turning, terms.new_full((batch, 1), math.inf)], 1
     ).clamp(max=_FARTHEST)
+    gaps = exponents.diff()
 
     def value(radius: Tensor) -> Tensor:
-        powers = torch.where(
-            radius.unsqueeze(-1) > 0, radius.unsqueeze(-1) ** exponents, (exponents == 0).double()
-        )
-        return (powers * terms[:, None]).sum(-1)
+        # Horner's rule: no infinity meets another of the other sign.
+        total = terms[:, -1:].expand_as(radius)
+        for k in range(count - 2, -1, -1):
+            total = terms[:, k : k + 1] + radius ** gaps[k] * total
+        return total
 
     low, high = knots[:, :-1], knots[:, 1:]
     sign = torch.sign(value(low))

@@ -298,7 +298,7 @@ class TestCentreStart:
     def test_it_may_be_elsewhere(self):
         near = estimate(barrel(), center=torch.tensor([[326.0, 232.0]]))
         far = estimate(barrel(), center=torch.tensor([[290.0, 260.0]], dtype=torch.float64))
-        torch.testing.assert_close(near.lens.center, far.lens.center, atol=1e-7, rtol=0)
+        torch.testing.assert_close(near.lens.center, far.lens.center, atol=1e-5, rtol=0)
 
     def test_the_default_is_the_middle_of_the_picture(self):
         middle = estimate(barrel(), center=MIDDLE)

@@ -6,7 +6,8 @@ import torch
 
 from tests import synthetic
 from torchptz.estimation.fixed_point import iterate
-from torchptz.estimation.maximum_likelihood import maximise, start_from_loop
+from torchptz.estimation.lines import fit_lines
+from torchptz.estimation.maximum_likelihood import maximise, undistorted_start
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, linearise, settle_lines
 from torchptz.estimation.residuals import State
@@ -34,30 +35,23 @@ def everything(problem):
 
 
 class TestStart:
-    def test_it_is_a_few_steps_of_the_papers_loop(self):
+    def test_it_is_a_lens_without_distortion_and_the_lines_of_the_points_as_they_are(self):
         problem = problem_of(synthetic.lens(), STRONG)
-        center = MIDDLE.expand(2, 2)
-        for steps in (0, 2):
-            loop = iterate(problem, center, max_iterations=steps)
-            state = start_from_loop(problem, center, everything(problem), steps)
-            expected = torch.cat([loop.center, loop.coefficients], 1)
-            assert torch.equal(state.theta, expected)
-            lines = State.from_parameters(problem, expected)
-            assert torch.equal(state.angle, lines.angle)
-            assert torch.equal(state.offset, lines.offset)
-
-    def test_a_centre_that_is_not_free_stays(self):
-        problem = problem_of(synthetic.lens(), STRONG)
-        free = everything(problem)
-        free[1, :2] = False
-        state = start_from_loop(problem, MIDDLE.expand(2, 2), free, 3)
-        assert torch.equal(state.theta[1:, :2], MIDDLE)
-        assert torch.linalg.vector_norm(state.theta[0, :2] - MIDDLE) > 1
+        center = MIDDLE + torch.tensor([[3.0, -2.0], [0.0, 5.0]])
+        state = undistorted_start(problem, center)
+        assert torch.equal(state.theta[:, :2], center)
+        assert (state.theta[:, 2:] == 0).all()
+        lines = fit_lines(problem.points, problem.weight)
+        across = torch.stack([state.angle.cos(), state.angle.sin()], -1)
+        assert ((across * lines.normal).sum(-1).abs() > 1 - 1e-12).all()
+        away = problem.points - problem.middle[:, None, None]
+        distance = (away * across[:, :, None]).sum(-1) + state.offset[..., None]
+        expected = lines.distance(problem.points)
+        torch.testing.assert_close(distance.abs(), expected.abs(), atol=1e-9, rtol=0)
 
     def test_gains_start_at_one(self):
         problem = problem_of(synthetic.lens(), offsets=True)
-        state = start_from_loop(problem, MIDDLE, everything(problem), 1)
-        assert state.theta[:, 5:].tolist() == [[1.0]]
+        assert undistorted_start(problem, MIDDLE).theta[:, 5:].tolist() == [[1.0]]
 
 
 class TestMaximise:
@@ -70,7 +64,7 @@ class TestMaximise:
         away = maximise(problem, MIDDLE.expand(3, 2) + synthetic.double(x, y), free)
         assert home.converged.all()
         assert away.converged.all()
-        torch.testing.assert_close(home.state.theta, away.state.theta, atol=1e-7, rtol=0)
+        torch.testing.assert_close(home.state.theta, away.state.theta, atol=1e-5, rtol=0)
 
     def test_it_is_more_likely_than_where_the_papers_loop_ends(self):
         problem = problem_of(STRONG, synthetic.lens(), sigma=0.5)
@@ -96,12 +90,11 @@ class TestMaximise:
         np.testing.assert_allclose(chi.mean() / 5, 1.0, atol=0.14)
         assert found.iterations.max() < 25
 
-    def test_the_iterations_of_the_loop_are_counted_in(self):
+    def test_without_a_step_it_has_not_converged(self):
         problem = problem_of(synthetic.lens())
         none = maximise(problem, MIDDLE, everything(problem), max_steps=0)
-        assert none.iterations == 2
+        assert none.iterations == 0
         assert not none.converged.any()
-        assert maximise(problem, MIDDLE, everything(problem)).iterations > 2
 
     def test_a_prior_pulls_as_hard_as_it_is_sure(self):
         problem = problem_of(synthetic.lens())

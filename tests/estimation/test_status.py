@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests import synthetic
 from torchptz.estimation import Status, estimate
@@ -12,10 +14,11 @@ from torchptz.estimation.status import (
     BORDER_SIGMA_LIMIT,
     CENTER_SIGMA_LIMIT,
     FLAT_CENTER_SIGMA,
+    SEEN_LIMIT,
+    Used,
     border_sigma,
     center_sigma,
     center_unobservable,
-    too_few,
 )
 from torchptz.patterns import LinePatterns
 
@@ -123,7 +126,8 @@ class TestTooFew:
         used = torch.ones(4, 6, 3, dtype=torch.bool)
         used[1, 0, 0] = False  # a line of two points has no freedom
         used[2, 2:] = False
-        assert too_few(used, torch.tensor([5, 5, 1, 6])).tolist() == [False, True, True, True]
+        few = Used.of(used).too_few(torch.tensor([5, 5, 1, 6]))
+        assert few.tolist() == [False, True, True, True]
 
     def test_nothing_at_all(self):
         pattern = barrel()
@@ -173,6 +177,27 @@ class TestCentreSigma:
         torch.testing.assert_close(
             center_sigma(covariance), synthetic.double(3.0, float("inf"), 1.0)
         )
+
+    @given(st.lists(st.floats(-1e3, 1e3), min_size=4, max_size=4))
+    def test_is_the_root_of_the_largest_eigenvalue(self, factor):
+        root = synthetic.double(*factor).reshape(2, 2)
+        covariance = torch.zeros(1, 3, 3, dtype=torch.float64)
+        covariance[0, :2, :2] = root @ root.T
+        expected = torch.linalg.matrix_norm(root, 2)[None]
+        torch.testing.assert_close(center_sigma(covariance), expected, rtol=1e-12, atol=1e-12)
+
+    @pytest.mark.parametrize("count", [1, 2, 3, 5])
+    def test_coefficients_are_weighed_with_all_of_their_covariance(self, count):
+        rng = np.random.default_rng(count)
+        root = torch.from_numpy(rng.normal(size=(400, count, count)))
+        block = 1e-4 * (root @ root.mT)
+        covariance = torch.eye(2 + count, dtype=torch.float64).repeat(400, 1, 1)
+        covariance[:, 2:, 2:] = block
+        coefficients = torch.from_numpy(rng.normal(size=(400, count))) * 0.03
+        solved = torch.linalg.solve(block, coefficients)
+        expected = (coefficients * solved).sum(-1) <= SEEN_LIMIT * count
+        assert self.judged(coefficients, covariance) == expected.tolist()
+        assert 10 < int(expected.sum()) < 390
 
     def judged(self, coefficients, covariance, converged=True):
         batch = len(coefficients)

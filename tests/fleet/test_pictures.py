@@ -1,18 +1,23 @@
 """Picture files: read whole or not at all, rectified without harm to the originals."""
 
+import threading
+from itertools import repeat
+
 import cv2
 import numpy as np
 import pytest
 
 from tests import synthetic
+from torchptz.fleet import pictures as module
 from torchptz.fleet.pictures import (
     UnreadablePicture,
     find_pictures,
     read_picture,
     rectify_pictures,
+    rectify_stream,
     write_picture,
 )
-from torchptz.rectification import rectify
+from torchptz.rectification import canvas_of, rectify
 from torchptz.zoom_table import Knot, ZoomTable
 
 SIZE = (96, 64)
@@ -70,6 +75,29 @@ class TestReading:
         path.write_bytes(data[: int(part * len(data))])
         with pytest.raises(UnreadablePicture):
             read_picture(path)
+
+    def test_the_end_of_a_small_picture_inside_is_no_end(self, tmp_path):
+        data = cv2.imencode(".jpg", picture())[1].tobytes()
+        small = cv2.imencode(".jpg", picture(1)[::4, ::4])[1].tobytes()
+        segment = b"Exif\x00\x00" + small
+        head = data[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment
+        path = tmp_path / "a.jpg"
+        path.write_bytes(head + data[2:])
+        assert np.array_equal(read_picture(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        path.write_bytes(head)
+        with pytest.raises(UnreadablePicture):
+            read_picture(path)
+
+    def test_a_cut_progressive_jpeg_is_no_picture(self, tmp_path):
+        path = tmp_path / "cut.jpg"
+        progressive = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+        data = cv2.imencode(".jpg", picture(), progressive)[1].tobytes()
+        path.write_bytes(data)
+        assert read_picture(path).shape == (*SIZE[::-1], 3)
+        for cut in range(len(data) // 4, len(data) - 2, 7):
+            path.write_bytes(data[:cut])
+            with pytest.raises(UnreadablePicture):
+                read_picture(path)
 
     def test_data_after_a_whole_jpeg_does_not_matter(self, tmp_path):
         write_picture(tmp_path / "a.jpg", picture())
@@ -134,6 +162,112 @@ class TestRectifying:
         assert len(done.written) == 2
 
 
+class TestManyAtOnce:
+    """A pipeline of several threads gives what one picture after the other gave."""
+
+    COUNT = 24
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        inside = tmp_path / "in"
+        inside.mkdir()
+        for seed in range(self.COUNT):
+            write_picture(inside / f"{seed:02}.{('jpg', 'png')[seed % 2]}", picture(seed))
+        return inside
+
+    @pytest.mark.parametrize("workers", [1, 2, 5])
+    @pytest.mark.parametrize("canvas", ["same", "valid"])
+    def test_pictures_are_those_of_plain_rectify(self, folder, tmp_path, workers, canvas):
+        done = rectify_pictures(WIDE, [folder], tmp_path / "out", canvas=canvas, workers=workers)
+        assert [path.name for path in done.written] == [p.name for p in find_pictures(folder)]
+        for path in done.written:
+            wanted = rectify(read_picture(folder / path.name), LENSES[0], canvas=canvas)
+            write_picture(tmp_path / f"wanted{path.suffix}", wanted)
+            assert path.read_bytes() == (tmp_path / f"wanted{path.suffix}").read_bytes()
+
+    def test_order_of_what_is_written_fails_and_is_told(self, folder, tmp_path):
+        broken = ["03.png", "04.jpg", "17.png"]
+        for name in broken:
+            (folder / name).write_bytes((folder / name).read_bytes()[:200])
+        steps = []
+        done = rectify_pictures(
+            WIDE, [folder], tmp_path / "out", progress=lambda *step: steps.append(step), workers=5
+        )
+        names = [path.name for path in find_pictures(folder)]
+        assert [path.name for path in done.failed] == broken
+        assert [p.name for p in done.written] == [name for name in names if name not in broken]
+        assert steps == [(n, self.COUNT) for n in range(self.COUNT + 1)]
+
+    @pytest.mark.parametrize("workers", [1, 3])
+    def test_no_more_pictures_are_in_memory_than_workers(
+        self, folder, tmp_path, monkeypatch, workers
+    ):
+        lock, alive, most = threading.Lock(), [0], [0]
+
+        def counted(path):
+            with lock:
+                alive[0] += 1
+                most[0] = max(most[0], alive[0])
+            return read_picture(path)
+
+        def written(path, rectified):
+            write_picture(path, rectified)
+            with lock:
+                alive[0] -= 1
+
+        monkeypatch.setattr(module, "read_picture", counted)
+        monkeypatch.setattr(module, "write_picture", written)
+        done = rectify_pictures(WIDE, [folder], tmp_path / "out", workers=workers)
+        assert len(done.written) == self.COUNT
+        assert most[0] <= workers
+        assert alive[0] == 0
+
+    def test_an_interrupt_leaves_whole_pictures_only(self, folder, tmp_path):
+        def interrupted(done, total):
+            if done == 3:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            rectify_pictures(WIDE, [folder], tmp_path / "out", progress=interrupted, workers=2)
+        names = {path.name for path in (tmp_path / "out").iterdir()}
+        assert {path.name for path in find_pictures(folder)[:3]} <= names
+        assert names <= {path.name for path in find_pictures(folder)[: 3 + 4]}  # in flight
+        for name in names:
+            assert read_picture(tmp_path / "out" / name).shape == (*SIZE[::-1], 3)
+
+    def test_a_defect_says_at_which_picture(self, folder, tmp_path, monkeypatch):
+        def broken(path):
+            if path.name == "02.jpg":
+                raise TypeError("a defect")
+            return read_picture(path)
+
+        monkeypatch.setattr(module, "read_picture", broken)
+        with pytest.raises(TypeError) as caught:
+            rectify_pictures(WIDE, [folder], tmp_path / "out")
+        assert str(folder / "02.jpg") in caught.value.__notes__[0]
+        assert (tmp_path / "out" / "01.png").exists()
+
+
+class TestStream:
+    def test_frames_are_those_of_plain_rectify(self):
+        frames = [picture(seed) for seed in range(20)]
+        found = list(rectify_stream(iter(frames), LENSES[0], workers=3))
+        for frame, rectified in zip(frames, found, strict=True):
+            assert np.array_equal(rectified, rectify(frame, LENSES[0]))
+
+    def test_canvas_and_mode(self):
+        canvas = canvas_of(LENSES[1], "all")
+        found = next(rectify_stream(repeat(picture()), LENSES[1], canvas, "nearest"))
+        assert np.array_equal(found, rectify(picture(), LENSES[1], "all", "nearest"))
+
+    def test_a_frame_of_another_size_in_its_turn(self):
+        frames = [picture(), picture(1), picture(2)[:10], picture(3)]
+        results = rectify_stream(frames, LENSES[0])
+        assert next(results).shape == next(results).shape == frames[0].shape
+        with pytest.raises(ValueError, match="96x10"):
+            next(results)
+
+
 class TestRefusals:
     """Nothing is written where the call as a whole is wrong."""
 
@@ -183,3 +317,31 @@ class TestRefusals:
         (tmp_path / "out").write_text("")
         with pytest.raises(ValueError, match="is a file"):
             rectify_pictures(WIDE, [folder], tmp_path / "out")
+
+
+class TestScript:
+    @pytest.fixture
+    def script(self, load, monkeypatch, tmp_path):
+        """Call scripts/rectify_images.py; its exit code."""
+        WIDE.save(tmp_path / "table.json")
+
+        def call(*arguments):
+            everything = ["rectify_images", tmp_path / "table.json", *arguments]
+            monkeypatch.setattr("sys.argv", [str(one) for one in everything])
+            return load("rectify_images").main()
+
+        return call
+
+    def test_a_folder(self, script, folder, tmp_path):
+        assert script(folder, "-o", tmp_path / "out") == 0
+        wanted = rectify(picture(1), LENSES[0])
+        assert np.array_equal(read_picture(tmp_path / "out" / "1.png"), wanted)
+
+    def test_exit_codes(self, script, folder, tmp_path, capsys):
+        assert script(folder, tmp_path / "missing.png", "-o", tmp_path / "out") == 1
+        assert script(tmp_path / "missing.png", "-o", tmp_path / "out") == 2
+        assert script(folder, "-o", folder) == 2
+        said = capsys.readouterr()
+        assert "3 pictures rectified" in said.out
+        assert "missing.png: No such file" in said.err
+        assert "would overwrite" in said.err

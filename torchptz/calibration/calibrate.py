@@ -33,6 +33,7 @@ def calibrate(
     priors: Priors | None = None,
     powers: Sequence[float] | str = (1, 2, 3),
     robust: bool = True,
+    backend: str = "auto",
 ) -> Calibration:
     """Complete internal calibration of every camera of a batch from the poses of its head.
 
@@ -49,27 +50,30 @@ def calibrate(
         powers: K positive, increasing powers of r in L; or "auto", which gives the zooms that 1, 2
             and 3 cannot follow two more. Coefficients that a zoom does not need are 0.
         robust: set outlying observations aside.
+        backend: "torch" on any device, "numba" for compiled kernels on a CPU; "auto": kernels where
+            they can be. Both find the same, to rounding.
 
     Returns:
         Calibration. Cameras are independent: a bad one gets its own statuses and changes no
         other's numbers.
 
     Raises:
-        ValueError: priors or powers that do not fit.
+        ValueError: priors, powers or a backend that do not fit.
 
     Source: README, "Beyond the paper".
     """
     priors = priors or Priors()
     if not isinstance(powers, str):
-        return _in_parts(observations, priors, checked_powers(powers), robust)
+        return _in_parts(observations, priors, checked_powers(powers), robust, backend)
     if powers != "auto":
         raise ValueError(f'powers are numbers, or "auto", not {powers!r}')
-    first = _in_parts(observations, priors, checked_powers(_FEW), robust)
+    first = _in_parts(observations, priors, checked_powers(_FEW), robust, backend)
     return _in_parts(
         observations,
         priors,
         checked_powers(_MANY),
         robust,
+        backend,
         first.misfit[..., 2, 2] > 0,
     )
 
@@ -79,18 +83,19 @@ def _in_parts(
     priors: Priors,
     powers: Tensor,
     robust: bool,
+    backend: str,
     richer: Tensor | None = None,
 ) -> Calibration:
     """Calibrate as many cameras at a time as the memory is good for.
 
     richer: (C, Z) bool, zooms that have all powers and not only the first few; None: all have.
     """
-    problem = Problem.from_observations(observations, powers)
+    problem = Problem.from_observations(observations, powers, backend)
     known = known_of(priors, observations, problem.layout, problem.used)
     if richer is not None:
         known = known.with_coefficients_held(problem.layout, len(_FEW), ~richer)
     noise = _assumed_noise(priors, observations)
-    size = 2 * problem.pixel.shape[1] * problem.layout.size
+    size = 2 * problem.pixel.shape[1] * problem.layout.compact
     step = max(1, _CHUNK // max(1, size))
     parts = [slice(begun, begun + step) for begun in range(0, len(observations), step)]
     learn = not priors.reading_known

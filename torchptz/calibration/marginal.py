@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchptz.batch import Batched
 from torchptz.calibration.model import Prediction
-from torchptz.calibration.problem import Problem
+from torchptz.calibration.problem import Problem, rows_of, sums_of
 
 _HEAD_FACTOR, _PIXEL_FACTOR = 10.0, 2.0  # of a sigma, one standard deviation
 _FARTHEST = 3.0  # step of the logarithm of a variance
@@ -51,7 +51,8 @@ class Normal(Batched):
 
     matrix: Tensor  # (C, T, T)
     right: Tensor  # (C, T), minus half the gradient of the cost
-    to_stops: Tensor  # (C, S, 2, T), B^T D^-1 A
+    # (C, 2, T, T) what follows of the unknowns for the stops' pan and tilt, squared and summed
+    reach: Tensor | None
 
 
 def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
@@ -65,6 +66,10 @@ def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
         by_pose: (C, N, 2, 2) px per rad.
         noise: of picture and head.
     """
+    if problem.compiled:
+        from torchptz.calibration import fused
+
+        return fused.metric_of(problem, by_pose, noise)
     precision = problem.weight / (problem.sigma**2 * noise.pixel[:, None])
     information = problem.per_stop(_product(by_pose.mT, by_pose * precision[..., None, None]))
     weight = problem.weight.new_zeros(len(problem), problem.stops)
@@ -85,31 +90,84 @@ def at_stops(problem: Problem, metric: Metric, values: Tensor) -> Tensor:
 
 def cost(problem: Problem, metric: Metric, residual: Tensor) -> Tensor:
     """(C,) squared residuals (C, N, 2) px in the metric: variances of 1 if the noise is right."""
+    if problem.compiled:
+        from torchptz.calibration import fused
+
+        return fused.cost(problem, metric, residual)
     plain = (metric.precision * residual.square().sum(-1)).sum(1)
     pull = at_stops(problem, metric, residual.unsqueeze(-1))
     return plain - (pull * _product(metric.inner, pull)).sum((1, 2, 3))
 
 
-def normal_of(problem: Problem, metric: Metric, prediction: Prediction, residual: Tensor) -> Normal:
-    """Normal equations about a state."""
-    columns = dense(problem, prediction.by_theta)
-    weighted = columns * metric.precision[..., None, None]
-    to_stops = at_stops(problem, metric, columns)
-    pull = at_stops(problem, metric, residual.unsqueeze(-1))
-    through = _product(metric.inner, to_stops).flatten(1, 2)
-    flat = to_stops.flatten(1, 2)
-    matrix = columns.flatten(1, 2).mT @ weighted.flatten(1, 2) - flat.mT @ through
-    right = (weighted * residual.unsqueeze(-1)).sum((1, 2)) - (
-        through.mT @ pull.flatten(1, 2)
-    ).squeeze(-1)
-    return Normal((matrix + matrix.mT) / 2, right, to_stops)
+def normal_of(
+    problem: Problem,
+    metric: Metric,
+    prediction: Prediction,
+    residual: Tensor,
+    learn: bool = True,
+) -> Normal:
+    """Normal equations about a state.
+
+    A stop with a single look needs no elimination: the look's own 2 x 2 precision holds its
+    reading's error. What is left are products of small dense blocks, zoom by zoom, and those of the
+    few stops with several looks, which may be at several zooms.
+
+    Args:
+        problem, metric, prediction: at the state.
+        residual: (C, N, 2) px.
+        learn: whether `learned_noise` is going to be asked for.
+    """
+    if problem.compiled:
+        from torchptz.calibration import fused
+
+        return fused.normal_of(problem, metric, prediction, residual, learn)
+    groups, layout = problem.groups, problem.layout
+    # D^-1 B of every look, and D^-1, less what its stop takes of it if it is there alone.
+    pulled = prediction.by_pose * metric.precision[..., None, None]  # (C, N, 2, 2)
+    taken = _product(_product(pulled, rows_of(metric.inner, problem.stop)), pulled.mT)
+    own = metric.precision[..., None, None] * _unit(pulled)
+    own = own - torch.where(groups.shared[..., None, None], 0.0, taken)
+
+    place = groups.at_zoom.flatten(1)  # (C, Z M)
+    there = groups.at_zoom_there.flatten(1)[..., None, None]
+    columns = rows_of(prediction.by_theta, place)
+    columns = layout.of_all_features(columns, rows_of(problem.feature, place))
+
+    def by_zoom(values: Tensor) -> Tensor:
+        """(C, Z, 2 M, W) of (C, Z M, 2, W)."""
+        return values.unflatten(1, groups.at_zoom.shape[1:]).flatten(2, 3)
+
+    weighed = by_zoom(_product(torch.where(there, rows_of(own, place), 0.0), columns))
+    matrix = layout.from_zooms(by_zoom(columns).mT @ weighed)
+    away = by_zoom(rows_of(residual, place).unsqueeze(-1))
+    right = layout.sum_of_zooms((weighed.mT @ away).squeeze(-1))
+
+    # The stops with several looks: B^T D^-1 of their columns and residuals.
+    seldom = groups.at_shared
+    several = layout.dense(rows_of(prediction.by_theta, seldom), rows_of(problem.index, seldom))
+    several = torch.cat([several, rows_of(residual, seldom).unsqueeze(-1)], -1)
+    pull = torch.where(groups.at_shared_there[..., None, None], rows_of(pulled, seldom), 0.0)
+    both = sums_of(_product(pull.mT, several), groups.new_stop, groups.stop.shape[1])
+    to_stops, away = both[..., :-1], both[..., -1:].flatten(1, 2)  # (C, R, 2, T)
+    through = _product(rows_of(metric.inner, groups.stop), to_stops).flatten(1, 2)
+    matrix = matrix - to_stops.flatten(1, 2).mT @ through
+    right = right - (through.mT @ away).squeeze(-1)
+    matrix = (matrix + matrix.mT) / 2
+    if not learn:
+        return Normal(matrix, right, None)
+
+    answer = metric.answer / metric.stop_weight.sqrt()[..., None, None]
+    answers = torch.where(groups.shared[..., None, None], 0.0, rows_of(answer, problem.stop))
+    answers = torch.where(there, rows_of(_product(answers, pulled.mT), place), 0.0)
+    poses = by_zoom(_product(answers, columns)).unflatten(2, (-1, 2)).movedim(3, 1)
+    reach = layout.from_zooms(poses.mT @ poses)  # (C, 2, T, T)
+    poses = _product(rows_of(answer, groups.stop), to_stops).movedim(2, 1)
+    return Normal(matrix, right, reach + poses.mT @ poses)
 
 
 def dense(problem: Problem, compact: Tensor) -> Tensor:
     """(C, N, 2, T) derivatives by all unknowns, of those (C, N, 2, compact) that matter."""
-    index = problem.index.unsqueeze(2).expand_as(compact)
-    out = compact.new_zeros(*compact.shape[:3], problem.layout.size)
-    return out.scatter_(3, index, compact)
+    return problem.layout.dense(compact, problem.index)
 
 
 def distances(problem: Problem, by_pose: Tensor, noise: Noise, residual: Tensor) -> Tensor:
@@ -147,26 +205,16 @@ def learned_noise(
     Source: restricted maximum likelihood (Patterson and Thompson 1971) by Fisher scoring; the
     information of a variance per stop is half the square of what the stop says of its pose.
     """
-    share = 1 / metric.stop_weight.unsqueeze(-1)
-    pull = _product(metric.answer, at_stops(problem, metric, residual.unsqueeze(-1)))
-    found = (pull[..., 0].square() * share).sum(1)  # (C, 2)
-    reach = _product(metric.answer, normal.to_stops)  # (C, S, 2, T)
-    fitted = ((reach.flatten(1, 2) @ covariance) * reach.flatten(1, 2)).sum(-1)
-    fitted = fitted.unflatten(1, reach.shape[1:3])
-    seen = _product(metric.answer, metric.information)  # (C, S, 2, 2) of a stop's pose, in all
-    expected = ((seen.diagonal(dim1=-2, dim2=-1) - fitted) * share).sum(1)
-
+    found, seen, crossed = noise_sums(problem, metric, noise, residual)
+    expected = seen - (normal.reach * covariance.unsqueeze(1)).sum((2, 3))
     head_found, head_expected = (noise.head * found).sum(1), (noise.head * expected).sum(1)
     pixel_found = (cost(problem, metric, residual) - head_found).clamp_min(0)
     pixel_expected = freedom - head_expected
     # Of the logarithms: all of them of order 1.
     score = torch.cat([noise.head * (found - expected), (pixel_found - pixel_expected)[:, None]], 1)
-    part = seen * (noise.head[:, None, None] * share.unsqueeze(-1))  # of the pose, by its noise
-    crossed = (part * part.mT).sum(1)  # (C, 2, 2)
-    twice = _product(part, part).diagonal(dim1=-2, dim2=-1)
-    own = (part.diagonal(dim1=-2, dim2=-1) - twice).sum(1)
-    both = twice.sum((1, 2))
-    rest = 2 * problem.used.sum(1) - 2 * part.diagonal(dim1=-2, dim2=-1).sum((1, 2)) + both
+    part, twice = noise.head * seen, crossed.sum(2)
+    own = part - twice
+    rest = 2 * problem.used.sum(1) - (part + own).sum(1)
     system = torch.cat(
         [
             torch.cat([crossed, own.unsqueeze(-1)], 2),
@@ -187,6 +235,32 @@ def learned_noise(
     step = torch.linalg.solve_ex(system, (score / size).unsqueeze(-1)).result.squeeze(-1) / size
     factor = step.nan_to_num(0.0).clamp(-_FARTHEST, _FARTHEST).exp()
     return Noise(noise.head * factor[:, :2], noise.pixel * factor[:, 2])
+
+
+def noise_sums(
+    problem: Problem, metric: Metric, noise: Noise, residual: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What the stops say of the head's noise, summed.
+
+    Args:
+        problem, metric, noise: at a state.
+        residual: (C, N, 2) px.
+
+    Returns:
+        (C, 2) squared pulls of the stops' pans and tilts; (C, 2) what they would be if all
+        unknowns were known; (C, 2, 2) products of what the noise of one and of the other makes of
+        a stop's pose.
+    """
+    if problem.compiled:
+        from torchptz.calibration import fused
+
+        return fused.noise_sums(problem, metric, noise, residual)
+    share = 1 / metric.stop_weight.unsqueeze(-1)
+    pull = _product(metric.answer, at_stops(problem, metric, residual.unsqueeze(-1)))
+    whole = _product(metric.answer, metric.information) * share.unsqueeze(-1)
+    part = whole * noise.head[:, None, None]
+    seen = whole.diagonal(dim1=-2, dim2=-1).sum(1)
+    return (pull[..., 0].square() * share).sum(1), seen, (part * part.mT).sum(1)
 
 
 def _unit(like: Tensor) -> Tensor:

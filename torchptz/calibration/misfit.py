@@ -47,7 +47,7 @@ def misfit_of(problem: Problem, refined: Refined, known: Known) -> Tensor:
     prediction = predict(rich, theta)
     metric = metric_of(rich, prediction.by_pose, refined.noise)
     residual = torch.where(rich.used.unsqueeze(-1), rich.pixel - prediction.pixel, 0.0)
-    normal = normal_of(rich, metric, prediction, residual)
+    normal = normal_of(rich, metric, prediction, residual, learn=False)
     free = priors.free
     matrix = held_out(normal.matrix + torch.diag_embed(priors.information), free)
     right = normal.right + priors.information * (priors.mean - theta)

@@ -21,11 +21,11 @@ from torchptz.calibration.backlash import load_behind
 from torchptz.calibration.problem import Problem, rows_of
 from torchptz.radial import powers_of
 
-_NEWTON_STEPS = 8
-_SMALLEST_RADIUS = 1e-9  # units of r
-_LARGEST_RADIUS = 10.0
-_FLATTEST = 0.05  # of r L(r): behind its fold the lens has no inverse
-_NEAREST = 1e-3  # of Z, rays are of unit length: behind the camera there is no picture
+NEWTON_STEPS = 8
+SMALLEST_RADIUS = 1e-9  # units of r
+LARGEST_RADIUS = 10.0
+FLATTEST = 0.05  # of r L(r): behind its fold the lens has no inverse
+NEAREST = 1e-3  # of Z, rays are of unit length: behind the camera there is no picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +48,10 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     Returns:
         Prediction, also of observations that do not count.
     """
+    if problem.compiled and not theta.requires_grad:
+        from torchptz.calibration import fused
+
+        return fused.predict(problem, theta, derivatives)
     layout = problem.layout
     zooms, head, features = layout.split(theta)
     zoom = rows_of(zooms, problem.zoom)  # (C, N, per_zoom)
@@ -79,7 +83,7 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
 
     pupil = zoom[..., layout.pupil]
     x, y, ahead = tilted(-sin_a * cos_t, sin_t, cos_a * cos_t)
-    depth = (ahead - pupil * nearness).clamp_min(_NEAREST)
+    depth = (ahead - pupil * nearness).clamp_min(NEAREST)
     u, v = x / depth, y / depth
     focal = zoom[..., at.LOG_FOCAL].exp()
     point = head[..., at.POINT] + zoom[..., at.WANDER]
@@ -88,14 +92,14 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     to_x, to_y = focal * u - beside[..., 0], focal * aspect * v - beside[..., 1]
     coefficients = zoom[..., at.COEFFICIENTS : layout.pupil]
     per_px = 1 / problem.scale[:, None]
-    target = (torch.hypot(aspect * to_x, to_y) * per_px).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
+    target = (torch.hypot(aspect * to_x, to_y) * per_px).clamp(SMALLEST_RADIUS, LARGEST_RADIUS)
     seen = problem.pixel - point - beside
     guess = torch.hypot(aspect * seen[..., 0], seen[..., 1]) * per_px
     radius = _radius(problem, target, guess, coefficients)
     monomials = powers_of(radius, problem.exponents)
     correction = 1 + (coefficients * monomials).sum(-1)
     # Behind the fold L may vanish.
-    shrink = 1 / torch.where(correction.abs() < _FLATTEST, _FLATTEST, correction)
+    shrink = 1 / torch.where(correction.abs() < FLATTEST, FLATTEST, correction)
     qx, qy = to_x * shrink, to_y * shrink
     pixel = point + beside + torch.stack([qx, qy], -1)
     if not derivatives:
@@ -124,7 +128,7 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
     j_xx, j_xy = correction + slope * qx * mx, slope * qx * my
     j_yx, j_yy = slope * qy * mx, correction + slope * qy * my
     determinant = j_xx * j_yy - j_xy * j_yx
-    determinant = torch.where(determinant.abs() < _FLATTEST**2, _FLATTEST**2, determinant)
+    determinant = torch.where(determinant.abs() < FLATTEST**2, FLATTEST**2, determinant)
 
     def distorted(move: tuple[Tensor, Tensor]) -> Tensor:
         dx, dy = move
@@ -166,12 +170,12 @@ def predict(problem: Problem, theta: Tensor, derivatives: bool = True) -> Predic
 
 def _radius(problem: Problem, target: Tensor, guess: Tensor, coefficients: Tensor) -> Tensor:
     """(C, N) the r with r L(r) = target, by Newton from a guess next to it."""
-    radius = torch.where(guess > 0, guess, target).clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
+    radius = torch.where(guess > 0, guess, target).clamp(SMALLEST_RADIUS, LARGEST_RADIUS)
     both = torch.stack([coefficients, coefficients * (problem.powers + 1)], -1)  # (C, N, K, 2)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         value, slope = (
             (powers_of(radius, problem.exponents).unsqueeze(-1) * both).sum(-2).unbind(-1)
         )
-        radius = radius - (radius * (1 + value) - target) / (1 + slope).clamp_min(_FLATTEST)
-        radius = radius.clamp(_SMALLEST_RADIUS, _LARGEST_RADIUS)
+        radius = radius - (radius * (1 + value) - target) / (1 + slope).clamp_min(FLATTEST)
+        radius = radius.clamp(SMALLEST_RADIUS, LARGEST_RADIUS)
     return radius

@@ -78,3 +78,40 @@ class Layout:
         first += len(HEAD)
         ray = feature.unsqueeze(-1) * len(FEATURE) + torch.arange(len(FEATURE), device=device)
         return torch.cat([own, head, first + ray], -1)
+
+    def dense(self, compact: Tensor, index: Tensor) -> Tensor:
+        """(C, N, 2, T) derivatives by all unknowns, of those (C, N, 2, compact) that `index` (C, N,
+        compact) places."""
+        out = compact.new_zeros(*compact.shape[:3], self.size)
+        return out.scatter_(3, index.unsqueeze(2).expand_as(compact), compact)
+
+    def of_all_features(self, compact: Tensor, feature: Tensor) -> Tensor:
+        """(C, N, 2, W) derivatives by the unknowns of an observation's zoom, the head and all
+        features, of those (C, N, 2, compact) that matter."""
+        if self.features == 1:
+            return compact
+        rest, ray = compact.tensor_split([self.compact - len(FEATURE)], -1)
+        each = torch.arange(self.features, device=feature.device)
+        its = (feature.unsqueeze(-1) == each)[:, :, None, :, None]  # (C, N, 1, F, 1)
+        return torch.cat([rest, torch.where(its, ray.unsqueeze(-2), 0.0).flatten(-2)], -1)
+
+    def from_zooms(self, blocks: Tensor) -> Tensor:
+        """Symmetric (..., T, T) sums of the zooms' blocks (..., Z, W, W), of the unknowns of a zoom
+        and then those that zooms share."""
+        own = self.per_zoom
+        lead = blocks.shape[:-3]
+        first = self.zooms * own
+        out = blocks.new_zeros(*lead, self.size, self.size)
+        each = torch.arange(self.zooms, device=blocks.device)
+        inner = out[..., :first, :first].unflatten(-1, (self.zooms, own))
+        inner = inner.unflatten(-3, (self.zooms, own))
+        inner.movedim((-4, -2), (0, 1))[each, each] = blocks[..., :own, :own].movedim(-3, 0)
+        across = blocks[..., :own, own:].flatten(-3, -2)
+        out[..., :first, first:], out[..., first:, :first] = across, across.mT
+        out[..., first:, first:] = blocks[..., own:, own:].sum(-3)
+        return out
+
+    def sum_of_zooms(self, parts: Tensor) -> Tensor:
+        """The same of vectors: (..., T) of (..., Z, W)."""
+        own, shared = parts.tensor_split([self.per_zoom], -1)
+        return torch.cat([own.flatten(-2), shared.sum(-2)], -1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -108,12 +109,12 @@ class Known(Batched):
     mean: Tensor  # (C, T)
     sigma: Tensor  # (C, T); 0: held, inf: not known
 
-    @property
+    @cached_property
     def free(self) -> Tensor:
         """(C, T) bool."""
         return self.sigma > 0
 
-    @property
+    @cached_property
     def information(self) -> Tensor:
         """(C, T), 0 for what is held: it has no say."""
         return torch.where(self.free, self.sigma, torch.inf) ** -2

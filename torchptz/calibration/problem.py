@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.calibration.groups import Groups, grouped
 from torchptz.calibration.parameters import Layout
+from torchptz.compiled import chosen
 from torchptz.geometry import wrap_angle
 from torchptz.observations import Observations
 
@@ -34,8 +37,11 @@ class Problem(Batched):
     image_size: Tensor  # (C, 2) px
 
     exponents: tuple[float, ...] | None = None  # the powers as plain numbers; None: of them
+    backend: str = "auto"  # how it is worked on, see `torchptz.compiled`
 
-    _shared: ClassVar[frozenset[str]] = frozenset({"layout", "stops", "powers", "exponents"})
+    _shared: ClassVar[frozenset[str]] = frozenset(
+        {"layout", "stops", "powers", "exponents", "backend"}
+    )
 
     def __post_init__(self) -> None:
         # Once: every look at numbers of a device waits for it.
@@ -43,9 +49,16 @@ class Problem(Batched):
             object.__setattr__(self, "exponents", tuple(self.powers.tolist()))
 
     @classmethod
-    def from_observations(cls, observations: Observations, powers: Tensor) -> Problem:
-        """All that was found, each with a weight of 1."""
+    def from_observations(
+        cls, observations: Observations, powers: Tensor, backend: str = "auto"
+    ) -> Problem:
+        """All that was found, each with a weight of 1.
+
+        Raises:
+            ValueError: a backend that there is not, or not for this device.
+        """
         o = observations
+        chosen(backend, o.pixel.device)
         layout = Layout(o.zooms.shape[1], max(1, o.features), len(powers))
         used = o.found & o.mask & (o.sigma > 0)
         used &= o.pixel.isfinite().all(-1) & o.read.isfinite().all(-1) & o.sigma.isfinite()
@@ -62,6 +75,7 @@ class Problem(Batched):
             _motor(o),
             o.image_size[:, 0] / 2,
             o.image_size,
+            backend=backend,
         )
 
     @property
@@ -70,26 +84,48 @@ class Problem(Batched):
         return self.weight > 0
 
     @property
+    def compiled(self) -> bool:
+        """Whether kernels work on it."""
+        return chosen(self.backend, self.pixel.device)
+
+    @property
     def index(self) -> Tensor:
         """(C, N, compact) places in theta of what each observation depends on."""
         return self.layout.index(self.zoom, self.feature)
 
+    def __getitem__(self, index: int | slice | Tensor) -> Problem:
+        items = super().__getitem__(index)
+        if "groups" in self.__dict__:
+            items.__dict__["groups"] = self.groups[index]
+        return items
+
+    @cached_property
+    def groups(self) -> Groups:
+        """Looks that count, by zoom and by stop."""
+        return grouped(self.zoom, self.stop, self.used, self.layout.zooms, self.stops)
+
     def using(self, weight: Tensor) -> Problem:
-        """The same with other weights (C, N)."""
-        return replace(self, weight=weight)
+        """The same with other weights (C, N), of observations that have one."""
+        other = replace(self, weight=weight)
+        other.__dict__["groups"] = self.groups  # what has no weight does no harm in them
+        return other
 
     def per_stop(self, values: Tensor) -> Tensor:
         """(C, S, ...) sums of values (C, N, ...) over the observations of each stop."""
-        tail = values.shape[2:]
-        where = self.stop.reshape(*self.stop.shape, *[1] * len(tail)).expand_as(values)
-        return values.new_zeros(len(values), self.stops, *tail).scatter_add(1, where, values)
+        return sums_of(values, self.stop, self.stops)
 
 
 def rows_of(values: Tensor, index: Tensor) -> Tensor:
     """(C, N, ...) rows of values (C, K, ...), such as those of the zoom (C, N) of every look."""
+    first = torch.arange(len(values), device=index.device)[:, None] * values.shape[1]
+    return values.flatten(0, 1)[index + first]
+
+
+def sums_of(values: Tensor, index: Tensor, count: int) -> Tensor:
+    """(C, count, ...) sums of values (C, N, ...) of the same index (C, N)."""
     tail = values.shape[2:]
-    where = index.reshape(*index.shape, *[1] * len(tail)).expand(*index.shape, *tail)
-    return values.gather(1, where)
+    where = index.reshape(*index.shape, *[1] * len(tail)).expand_as(values)
+    return values.new_zeros(len(values), count, *tail).scatter_add(1, where, values)
 
 
 def _motor(o: Observations) -> Tensor:

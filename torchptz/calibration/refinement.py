@@ -21,7 +21,7 @@ from torchptz.calibration.model import predict
 from torchptz.calibration.priors import Known
 from torchptz.calibration.problem import Problem
 
-_ROUND = 5  # steps between two looks at which cameras are still active
+_ROUND = 5  # steps; on another device, between two looks at which cameras are still active
 _MOST_ROUNDS = 16
 _DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-12, 1e10
 _UNKNOWN = 1e6  # a sigma of what nothing is known of
@@ -109,20 +109,21 @@ def refine(
         problem.used.any(1),
         torch.zeros(cameras, dtype=torch.bool, device=theta.device),
     )
-    for _ in range(rounds):
-        rows = progress.active.nonzero()[:, 0]
+    # Those that are done leave the batch; on another device that is a wait.
+    steps = 1 if theta.device.type == "cpu" else _ROUND
+    rows, part = torch.arange(cameras, device=theta.device), progress
+    problem_left, known_left, assumed_left = problem, known, assumed
+    for _ in range(rounds * _ROUND // steps):
+        active = part.active.nonzero()[:, 0]
+        if len(active) < len(rows):
+            progress = progress.with_items(rows, part)
+            rows, part = rows[active], part[active]
+            problem_left, known_left = problem[rows], known[rows]
+            assumed_left = None if assumed is None else assumed[rows]
         if len(rows) == 0:
             break
-        everyone = len(rows) == cameras
-        part = _advance(
-            *(problem, progress, known)
-            if everyone
-            else (problem[rows], progress[rows], known[rows]),
-            heavy_tails,
-            settled,
-            assumed if everyone or assumed is None else assumed[rows],
-        )
-        progress = part if everyone else progress.with_items(rows, part)
+        part = _advance(problem_left, part, known_left, heavy_tails, settled, assumed_left, steps)
+    progress = progress.with_items(rows, part)
     return _summed_up(problem.using(progress.weight), progress, known)
 
 
@@ -133,13 +134,14 @@ def _advance(
     heavy_tails: bool,
     settled: float,
     assumed: Noise | None,
+    steps: int,
 ) -> _Progress:
-    """Up to 5 steps of every active camera, without a look at the result in between."""
+    """Some steps of every active camera, without a look at the result in between."""
     theta, noise, weight = progress.theta, progress.noise, progress.weight
     damping, iterations, active = progress.damping, progress.iterations, progress.active
     converged, free, used = progress.converged, known.free, problem.used
     play_held, plays = progress.play_held, _plays(problem, theta)
-    for _ in range(_ROUND):
+    for _ in range(steps):
         prediction = predict(problem, theta)
         residual = _residual(problem, prediction.pixel)
         if heavy_tails:
@@ -151,7 +153,7 @@ def _advance(
             weight = torch.where(active[:, None], torch.where(used, likely, 0.0), weight)
         weighed = problem.using(weight)
         metric = metric_of(weighed, prediction.by_pose, noise)
-        normal = normal_of(weighed, metric, prediction, residual)
+        normal = normal_of(weighed, metric, prediction, residual, assumed is not None)
         matrix = normal.matrix + torch.diag_embed(known.information)
         right = normal.right + known.information * (known.mean - theta)
         # A play of nothing that wants to be less stays where it is. So does one at a kink: where it
@@ -205,7 +207,7 @@ def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:
     prediction = predict(problem, theta)
     residual = _residual(problem, prediction.pixel)
     metric = metric_of(problem, prediction.by_pose, noise)
-    normal = normal_of(problem, metric, prediction, residual)
+    normal = normal_of(problem, metric, prediction, residual, learn=False)
     matrix = held_out(normal.matrix + torch.diag_embed(known.information), known.free)
     covariance, failed = inverse(matrix)
     covariance = _of_free(covariance, known.free)

@@ -12,6 +12,7 @@ NORMAL_MEDIAN = 0.6745  # of |x| for a unit normal x
 FINEST = 1e-4
 
 _CANDIDATES = 60  # parabolas tried per line
+_AT_ONCE = 2**17  # points times parabolas looked at together
 _ARC_CUT, _ARC_DEGREE, _ARC_ROUNDS = 4.0, 4, 4
 
 
@@ -21,6 +22,10 @@ def neighbour_noise(problem: Problem) -> Tensor:
     Median distance of a point from the chord between its neighbours, over how much of it noise
     would be.
     """
+    if problem.compiled:
+        from torchptz.estimation import fused
+
+        return fused.neighbour_noise(problem, _shifted_points(problem)) / NORMAL_MEDIAN
     ordered, order = _along_lines(problem)
     root = problem.weight.sqrt().gather(2, order)
     before, point, after = ordered[:, :, :-2], ordered[:, :, 1:-1], ordered[:, :, 2:]
@@ -101,21 +106,27 @@ def _best_arc(
     bend = torch.where(base.abs() > 1e-9, v / base, 0.0)
     best = torch.full_like(count, torch.inf, dtype=points.dtype)
     chosen = torch.zeros_like(count)
-    half = _half(count).unsqueeze(-1)
-    for t in range(triples.shape[2]):
-        u, v = _in_frame(points, first[:, :, t], along[:, :, t])
-        arc = bend[:, :, t, None] * u * (u - length[:, :, t, None])
-        off = torch.where(used, (v - arc).abs(), torch.inf)
-        median = off.sort(-1).values.gather(-1, half).squeeze(-1)
-        better = (median < best) & (length[:, :, t] > 0)
-        best = torch.where(better, median, best)
-        chosen = torch.where(better, t, chosen)
+    half = _half(count)[..., None, None]
+    step = max(1, _AT_ONCE // max(1, used.numel()))
+    for begun in range(0, triples.shape[2], step):
+        part = (slice(None), slice(None), slice(begun, begun + step))
+        u, v = _in_frame(points, first[part], along[part])
+        arc = bend[part].unsqueeze(-1) * u * (u - length[part].unsqueeze(-1))
+        off = torch.where(used.unsqueeze(2), (v - arc).abs(), torch.inf)
+        median = off.sort(-1).values.gather(-1, half.expand(*off.shape[:3], 1)).squeeze(-1)
+        median = torch.where(length[part] > 0, median, torch.inf)
+        least = median.amin(-1)
+        better = least < best
+        best = torch.where(better, least, best)
+        number = (median == least.unsqueeze(-1)).to(torch.uint8).argmax(-1)  # the first of them
+        chosen = torch.where(better, begun + number, chosen)
 
-    def pick(values: Tensor) -> Tensor:
+    def pick(values: Tensor, keep: bool = False) -> Tensor:
         index = chosen.reshape(*chosen.shape, 1, *([1] * (values.ndim - 3)))
-        return values.gather(2, index.expand(-1, -1, 1, *values.shape[3:])).squeeze(2)
+        picked = values.gather(2, index.expand(-1, -1, 1, *values.shape[3:]))
+        return picked if keep else picked.squeeze(2)
 
-    u, v = _in_frame(points, pick(first), pick(along))
+    u, v = (value.squeeze(2) for value in _in_frame(points, pick(first, True), pick(along, True)))
     length = pick(length)[..., None]
     off = (v - pick(bend)[..., None] * u * (u - length)).abs()
     reach = length.clamp_min(1e-12) / 2
@@ -123,9 +134,9 @@ def _best_arc(
 
 
 def _in_frame(points: Tensor, origin: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates (B, L, P) of points (B, L, P, 2) along and across a direction (B, L, 2)."""
-    away = points - origin.unsqueeze(2)
-    u = (away * along.unsqueeze(2)).sum(-1)
+    """Coordinates (B, L, T, P) of points (B, L, P, 2) along and across directions (B, L, T, 2)."""
+    away = points.unsqueeze(2) - origin.unsqueeze(3)
+    u = (away * along.unsqueeze(3)).sum(-1)
     v = away[..., 1] * along[..., None, 0] - away[..., 0] * along[..., None, 1]
     return u, v
 

@@ -25,10 +25,9 @@ def center_step(
 ) -> Tensor:
     """Move each centre downhill on the sum of squared distances, lines refitted at every trial.
 
-    The gradient comes from autograd with the fitted lines held: at their optimum the objective does
-    not change with them to first order (envelope theorem), so that none is needed through the SVD.
-    It is scaled by the Gauss-Newton curvature (the residuals' derivatives with the lines projected
-    out) and the step is halved until the objective falls; an item for which it never does stays.
+    The gradient comes from autograd. It is scaled by the Gauss-Newton curvature (the residuals'
+    derivatives with the lines projected out) and the step is halved until the objective falls; an
+    item for which it never does stays.
 
     Args:
         problem: B items.
@@ -42,42 +41,67 @@ def center_step(
 
     Source: paper, section 2 (the centre's nonlinear step); refitting: README, "Beyond the paper".
     """
+    floor = _FLAT * problem.weight.sum((1, 2))[:, None, None] * torch.eye(2).to(center)
+    limit = _FARTHEST_STEP * problem.scale.unsqueeze(-1)
     for _ in range(steps):
         gradient, curvature, value = _derivatives(problem, center, coefficients, gain)
-        floor = _FLAT * problem.weight.sum((1, 2))
-        damped = curvature + floor[:, None, None] * torch.eye(2).to(curvature)
-        step = -torch.linalg.solve_ex(damped, gradient.unsqueeze(-1)).result.squeeze(-1)
+        step = -torch.linalg.solve_ex(curvature + floor, gradient.unsqueeze(-1)).result.squeeze(-1)
         length = torch.linalg.vector_norm(step, dim=-1, keepdim=True)
-        limit = _FARTHEST_STEP * problem.scale.unsqueeze(-1)
         step = step * (limit / length.clamp_min(1e-300)).clamp(max=1.0)
         center = _backtrack(problem, center, coefficients, gain, step, value)
     return center
 
 
-def _derivatives(
-    problem: Problem, center: Tensor, coefficients: Tensor, gain: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradient (B, 2), curvature (B, 2, 2) and value (B,) of half the objective."""
-    lines = fit_lines(problem.correct(center, coefficients, gain), problem.weight)
-    with torch.enable_grad():
-        free = center.detach().requires_grad_()
-        corrected = problem.correct(free, coefficients, gain)
-        value = (problem.weight * lines.distance(corrected) ** 2).sum((1, 2)) / 2
-        (gradient,) = torch.autograd.grad(value.sum(), free)
+def objective(
+    problem: Problem,
+    center: Tensor,
+    coefficients: Tensor,
+    gain: Tensor | None = None,
+) -> tuple[Tensor, Tensor | None]:
+    """Half the sum of squared distances to lines fitted anew, differentiable by the centre.
+
+    The lines are held in the gradient: at their optimum the objective does not change with them to
+    first order (envelope theorem), so that none is needed through the SVD.
+
+    Args:
+        problem: B items.
+        center: (B, 2) px.
+        coefficients: (B, K), held.
+        gain: (B,) of the known offsets, or None.
+
+    Returns:
+        (B,) px², and its Gauss-Newton curvature (B, 2, 2) if the centre requires a gradient.
+    """
+    if problem.compiled:
+        from torchptz.estimation import fused_loop
+
+        value, curvature = fused_loop.Objective.apply(center, problem, coefficients, gain)
+        return value, curvature if center.requires_grad else None
+    corrected = problem.correct(center, coefficients, gain)
+    lines = fit_lines(corrected.detach(), problem.weight)
+    value = (problem.weight * lines.distance(corrected) ** 2).sum((1, 2)) / 2
+    if not center.requires_grad:
+        return value, None
+    corrected, center = corrected.detach(), center.detach()
     columns = lines.normal[:, :, None] - distance_gradient(
         problem, center, coefficients, lines.normal
     )
-    free_columns = project_out_lines(columns, problem.weight, corrected.detach(), lines)
-    free_columns = free_columns.flatten(1, 2)
-    return gradient, free_columns.transpose(1, 2) @ free_columns, value.detach()
+    free_columns = project_out_lines(columns, problem.weight, corrected, lines).flatten(1, 2)
+    return value, free_columns.mT @ free_columns
 
 
-def _objective(
-    problem: Problem, center: Tensor, coefficients: Tensor, gain: Tensor | None
-) -> Tensor:
-    corrected = problem.correct(center, coefficients, gain)
-    distance = fit_lines(corrected, problem.weight).distance(corrected)
-    return (problem.weight * distance**2).sum((1, 2)) / 2
+def _derivatives(
+    problem: Problem,
+    center: Tensor,
+    coefficients: Tensor,
+    gain: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient (B, 2), curvature (B, 2, 2) and value (B,) of the objective."""
+    with torch.enable_grad():
+        free = center.detach().requires_grad_()
+        value, curvature = objective(problem, free, coefficients, gain)
+        (gradient,) = torch.autograd.grad(value.sum(), free)
+    return gradient, curvature, value.detach()
 
 
 def _backtrack(
@@ -95,7 +119,7 @@ def _backtrack(
     limit = value * (1 + _ROUNDING)
     for _ in range(_HALVINGS):
         trial = torch.where(waiting.unsqueeze(-1), center + step, moved)
-        falls = waiting & (_objective(problem, trial, coefficients, gain) <= limit)
+        falls = waiting & (objective(problem, trial, coefficients, gain)[0] <= limit)
         moved = torch.where(falls.unsqueeze(-1), trial, moved)
         waiting = waiting & ~falls
         if idle(waiting):

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.compiled import chosen
+from torchptz.estimation.buckets import buckets
 from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.implicit import differentiable
 from torchptz.estimation.maximum_likelihood import maximise
 from torchptz.estimation.misfit import inflation
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.refinement import Prior, Refined, refine, settle_lines
+from torchptz.estimation.refinement import Prior, Refined, linearise, refine, settle_lines
 from torchptz.estimation.residuals import State, split, straightness
 from torchptz.estimation.selection import CANDIDATES, UNION, solve_with_best_powers
 from torchptz.estimation.solution import GAIN_SIGMA, Search, Solution, solve, solve_robustly
@@ -54,6 +56,15 @@ class Fit(Batched):
     gain_sigma: Tensor | None  # alike
     status: list[Status]  # B
 
+    def _padded(self, lines: int, places: int) -> Fit:
+        """With residuals and inliers of so many lines and points."""
+        missing = (0, places - self.residuals.shape[2], 0, lines - self.residuals.shape[1])
+        return replace(
+            self,
+            residuals=torch.nn.functional.pad(self.residuals, missing),
+            inliers=torch.nn.functional.pad(self.inliers, missing),
+        )
+
 
 def estimate(
     patterns: LinePatterns,
@@ -68,6 +79,7 @@ def estimate(
     free_l0: bool = True,
     max_iterations: int = 1000,
     variance_threshold: float | None = None,
+    backend: str = "auto",
 ) -> Fit:
     """Estimate the lens of every pattern of a batch.
 
@@ -89,6 +101,9 @@ def estimate(
         free_l0: see `solve_coefficients` ("lanz" only).
         max_iterations: of the fixed point, per item ("lanz" only).
         variance_threshold: px², the paper's alternative stop of the fixed point ("lanz" only).
+        backend: "numba" works with compiled kernels, an item at a time, on a CPU; "torch" with
+            batched tensor operations on any device; "auto" takes the kernels where it can. What
+            they find agrees to some millionths of its standard deviation.
 
     Returns:
         Fit. Items are independent: a bad one gets its own status and changes no other's numbers.
@@ -104,6 +119,7 @@ def estimate(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
+    chosen(backend, patterns.points.device)  # before anything else can fail
     if method == "lanz" and patterns.points.requires_grad:
         raise ValueError(
             'gradients are those of the optimum that method "ml" finds; detach the points'
@@ -119,7 +135,7 @@ def estimate(
         return _loop(items, start, free, prior, free_l0, max_iterations, variance_threshold)
 
     def fit(patterns: LinePatterns, aspect: Tensor, search: Search) -> Fit:
-        problem = Problem.from_patterns(patterns, exponents, aspect, gain_per_axis)
+        problem = Problem.from_patterns(patterns, exponents, aspect, gain_per_axis, backend)
         with torch.no_grad():
             if choose:
                 used, solution = solve_with_best_powers(problem, search, solver, robust)
@@ -160,9 +176,20 @@ def estimate(
         raise ValueError("pixel_aspect must be positive")
     # Not all at once: what does not fit the caches is slow, and what does not fit the memory fails.
     most = _CHUNK // (len(CANDIDATES) if choose else 1)
-    step = max(1, most // max(1, patterns.mask.shape[1:].numel()))
-    parts = [slice(begun, begun + step) for begun in range(0, max(1, len(patterns)), step)]
-    return Fit.cat([fit(patterns[part], aspect[part], search[part]) for part in parts])
+    parts = buckets(patterns.mask, most)
+    if len(parts) == 1:
+        return fit(patterns, aspect, search)
+    shape = patterns.mask.shape[1:]
+    fits = [
+        fit(
+            patterns[part.rows].trimmed(part.lines, part.places),
+            aspect[part.rows],
+            search[part.rows],
+        )._padded(*shape)
+        for part in parts
+    ]
+    order = torch.cat([part.rows for part in parts])
+    return Fit.cat(fits)[order.argsort()]
 
 
 def _loop(
@@ -188,12 +215,13 @@ def _loop(
     gains = start.new_ones(len(start), problem.unknowns - 2 - len(problem.powers))
     theta = torch.cat([loop.center, loop.coefficients, gains], 1)
     state = State.from_parameters(problem, theta)
-    plain = Refined(settle_lines(problem, state), loop.iterations, loop.converged)
+    settled = settle_lines(problem, state)
+    plain = Refined(settled, loop.iterations, loop.converged, linearise(problem, settled))
     if gain is None:
         return plain
     refined = refine(problem, state, free, prior)
     offsets = free[:, 2 + len(problem.powers) :].any(-1)
-    joint = Refined(refined.state, loop.iterations + refined.iterations, refined.converged)
+    joint = replace(refined, iterations=loop.iterations + refined.iterations)
     return joint.where(offsets, plain)
 
 

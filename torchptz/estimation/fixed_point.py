@@ -10,10 +10,11 @@ from torch import Tensor
 from torchptz.batch import Batched
 from torchptz.estimation.center import center_step, idle
 from torchptz.estimation.coefficients import solve_coefficients
-from torchptz.estimation.lines import fit_lines
+from torchptz.estimation.lines import Lines, fit_lines, lines_of_scatter
+from torchptz.estimation.moments import LineMoments, line_moments, moments_step, orthogonal_basis
 from torchptz.estimation.problem import Problem
 
-_ROUND = 20  # iterations between two looks at which items are still active
+_ROUND = 5  # iterations between two looks at which items are still active
 _BLOWN_UP = 1e6  # a coefficient beyond it belongs to no lens
 
 
@@ -76,6 +77,10 @@ def iterate(
     Source: paper, section 2; stopping on l and c both: on real sets the change of l alone can stop
     8-17 px away from the centre.
     """
+    # With every centre held, no iteration needs the points.
+    held = hold_center is not None and bool(hold_center.all())
+    moments = _held_moments(problem, center, gain, free_l0) if held else None
+    items = _Items(problem, gain, hold_center, moments)
     active = torch.ones(len(center), dtype=torch.bool, device=center.device)
     state = _State(
         center,
@@ -94,10 +99,8 @@ def iterate(
         if len(rows) == 0:
             break
         part = _advance(
-            problem[rows],
+            items if len(rows) == len(center) else items[rows],
             state[rows],
-            None if gain is None else gain[rows],
-            None if hold_center is None else hold_center[rows],
             free_l0,
             min(length, max_iterations - begun),
             stop,
@@ -137,8 +140,27 @@ def fixed_point_step(
         moved = torch.where(hold_center.unsqueeze(-1), center, moved)
     # The lines are fitted again after the centre moved: with stale ones the loop ends in a cycle
     # of period two on noisy data.
-    lines = fit_lines(problem.correct(moved, coefficients, gain), problem.weight)
+    lines = _corrected_lines(problem, moved, coefficients, gain)
     return moved, solve_coefficients(problem, moved, lines, gain, free_l0)
+
+
+def _corrected_lines(
+    problem: Problem, center: Tensor, coefficients: Tensor, gain: Tensor | None
+) -> Lines:
+    """Total least squares lines (B, L) of the corrected points."""
+    if problem.compiled:
+        from torchptz.estimation import fused_loop
+
+        return lines_of_scatter(*fused_loop.scatter(problem, center, coefficients, gain))
+    return fit_lines(problem.correct(center, coefficients, gain), problem.weight)
+
+
+def _held_moments(
+    problem: Problem, center: Tensor, gain: Tensor | None, free_l0: bool
+) -> LineMoments:
+    """Moments about centres that stay: a pass for the basis, and one in it."""
+    basis = orthogonal_basis(line_moments(problem, center), free_l0)
+    return line_moments(problem, center, gain, basis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +172,24 @@ class _State(Batched):
     active: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class _Items(Batched):
+    """What an iteration works on."""
+
+    problem: Problem
+    gain: Tensor | None
+    hold_center: Tensor | None
+    moments: LineMoments | None  # about the centres, where all are held
+
+    def step(self, center: Tensor, coefficients: Tensor, free_l0: bool) -> tuple[Tensor, Tensor]:
+        """`fixed_point_step`."""
+        if self.moments is not None:
+            return center, moments_step(self.moments, coefficients, free_l0)
+        return fixed_point_step(
+            self.problem, center, coefficients, self.gain, self.hold_center, free_l0
+        )
+
+
 @dataclass(frozen=True)
 class _Stop:
     tolerance_l: float
@@ -158,16 +198,15 @@ class _Stop:
 
 
 def _advance(
-    problem: Problem,
+    items: _Items,
     state: _State,
-    gain: Tensor | None,
-    hold_center: Tensor | None,
     free_l0: bool,
     steps: int,
     stop: _Stop,
     history: list[Tensor] | None,
 ) -> _State:
     """Up to ``steps`` iterations of every active item."""
+    problem, gain = items.problem, items.gain
     center, coefficients, active = state.center, state.coefficients, state.active
     iterations, converged = state.iterations, state.converged
     for _ in range(steps):
@@ -180,7 +219,7 @@ def _advance(
                 converged, active = converged | done, active & ~done
         if idle(active):
             break
-        moved, solved = fixed_point_step(problem, center, coefficients, gain, hold_center, free_l0)
+        moved, solved = items.step(center, coefficients, free_l0)
         # A blown-up item keeps its last good state and stops alone; the SVDs of the others never
         # see its numbers.
         active = active & solved.isfinite().all(-1) & (solved.abs().amax(-1) < _BLOWN_UP)

@@ -35,17 +35,45 @@ def fit_lines(points: Tensor, weight: Tensor) -> Lines:
     Returns:
         Lines of shape (...).
 
-    Source: paper, section 2, first step. The normal is the right singular vector of the smaller
-    singular value of the centred points.
+    Source: paper, section 2, first step.
     """
     total = weight.sum(-1, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
-    mean = (weight.unsqueeze(-1) * points).sum(-2) / total
-    centered = weight.sqrt().unsqueeze(-1) * (points - mean.unsqueeze(-2))
+    mean = (weight.unsqueeze(-2) @ points).squeeze(-2) / total
+    centered = points - mean.unsqueeze(-2)
+    return lines_of_scatter(mean, (weight.unsqueeze(-1) * centered).mT @ centered)
+
+
+def lines_of_scatter(mean: Tensor, scatter: Tensor) -> Lines:
+    """Total least squares lines by batched SVD of their points' scatter.
+
+    The scatter's singular vectors are those of the centred points. Squaring halves the digits of
+    the smaller singular value, which is not asked for; the vectors keep theirs.
+
+    Args:
+        mean: (..., 2) px.
+        scatter: (..., 2, 2) px², of the points about the mean.
+
+    Returns:
+        Lines of shape (...), NaN where something is not finite.
+    """
     # One matrix that is not finite makes the SVD of the whole batch raise.
-    finite = centered.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
-    axes = torch.linalg.svd(torch.where(finite, centered, 0.0), full_matrices=False).Vh
+    finite = scatter.isfinite().all(-1, keepdim=True).all(-2, keepdim=True)
+    axes = torch.linalg.svd(torch.where(finite, scatter, 0.0)).Vh
     normal = torch.where(finite, axes, torch.nan)[..., -1, :]
     return Lines(normal, -(normal * mean).sum(-1))
+
+
+def across(scatter: Tensor) -> Tensor:
+    """Unit normals (..., 2) of lines whose points scatter so; closed form.
+
+    Args:
+        scatter: (..., 3), the sums of w x², w y² and w x y about the mean.
+
+    Exact to rounding, as the SVD: the direction hangs on the larger eigenvalue.
+    """
+    xx, yy, xy = scatter.unbind(-1)
+    angle = torch.atan2(2 * xy, xx - yy) / 2
+    return torch.stack([-angle.sin(), angle.cos()], -1)
 
 
 def project_out_lines(columns: Tensor, weight: Tensor, points: Tensor, lines: Lines) -> Tensor:

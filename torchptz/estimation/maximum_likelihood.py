@@ -1,32 +1,30 @@
-"""`method="ml"` for points that are all good: the paper's loop to start, then the joint step."""
+"""`method="ml"` for points that are all good: the joint step, from a lens without distortion."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined, refine
 from torchptz.estimation.residuals import State
 
-_LOOP_STEPS = 2  # of the paper's loop: from there Gauss-Newton finds home
 
+def undistorted_start(problem: Problem, center: Tensor) -> State:
+    """No distortion, offsets at face value, and the lines that go with it.
 
-def start_from_loop(problem: Problem, center: Tensor, free: Tensor, steps: int) -> State:
-    """A few iterations of the paper's loop, as a state.
+    There the objective does not depend on the centre, so that a step's damping keeps it until the
+    coefficients are roughly right. A start from some iterations of the paper's loop is nearer, but
+    not better: its centre has been moved with coefficients that were still far off.
 
     Args:
         problem: B items.
         center: (B, 2) px, where the centre starts.
-        free: (B, M) bool, the parameters to be moved.
-        steps: iterations.
     """
-    gain = None if problem.offsets is None else torch.ones_like(problem.scale)
-    loop = iterate(problem, center, gain=gain, hold_center=~free[:, 0], max_iterations=steps)
-    count = problem.unknowns - 2 - len(problem.powers)
-    gains = center.new_ones(len(center), count)
-    return State.from_parameters(problem, torch.cat([loop.center, loop.coefficients, gains], 1))
+    theta = torch.ones_like(problem.scale)[:, None].repeat(1, problem.unknowns)
+    theta[:, :2] = center
+    theta[:, 2 : 2 + len(problem.powers)] = 0
+    return State.from_parameters(problem, theta)
 
 
 def maximise(
@@ -46,10 +44,8 @@ def maximise(
         max_steps: of the joint step.
 
     Returns:
-        Refined, the iterations of the loop counted in.
+        Refined.
 
     Source: README, "The model, and conventions" (residuals).
     """
-    state = start_from_loop(problem, center, free, _LOOP_STEPS)
-    refined = refine(problem, state, free, prior, max_steps)
-    return Refined(refined.state, refined.iterations + _LOOP_STEPS, refined.converged)
+    return refine(problem, undistorted_start(problem, center), free, prior, max_steps)

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchptz.displacement import undistort_jacobian
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.refinement import reduce_lines
-from torchptz.estimation.residuals import State, derivatives, split
+from torchptz.estimation.refinement import linearise
+from torchptz.estimation.residuals import State, split
+from torchptz.lens import RadialLens
 
 _MORE_POWERS = 2
 # Standard deviations by which more powers must straighten the lines better to be believed.
@@ -43,7 +44,7 @@ def inflation(
     Source: score test (Rao 1948) and its one-step estimate.
     """
     rich, at, base = _with_more_powers(problem, state, free)
-    linear, _, _ = reduce_lines(rich, *derivatives(rich, at)[:3])
+    linear = linearise(rich, at)
     unit = torch.ones_like(linear.right)
     unit[:, :2] = rich.scale[:, None]
     normal = linear.normal * (unit[:, :, None] * unit[:, None])
@@ -59,20 +60,35 @@ def inflation(
     spread = (2 / (9 * more.clamp_min(1))).sqrt()
     bound = more * (1 - spread**2 + _CLEAR * spread) ** 3
     clear = (score * step).sum(-1) > bound * rms**2
+    grown = torch.ones_like(rms)
+    rows = clear.nonzero()[:, 0]
+    if len(rows) == 0:
+        return grown
+    lens = rich[rows].lens(*split(rich, at.theta[rows])[:2])
+    own = problem[rows].lens(*split(problem, state.theta[rows])[:2])
+    return grown.index_copy(0, rows, _growth(lens, step[rows], own, covariance[rows]))
 
-    lens = rich.lens(*split(rich, at.theta)[:2])
+
+def _growth(lens: RadialLens, step: Tensor, own: RadialLens, covariance: Tensor) -> Tensor:
+    """(B,) by how much the variance of a point would have to grow to hold its move.
+
+    Args:
+        lens: with more powers, their coefficients 0.
+        step: (B, M) of its parameters.
+        own: the lens as it was estimated.
+        covariance: (B, 2 + K, 2 + K) of that.
+    """
     axes = [(torch.arange(n, dtype=torch.float64) / (n - 1)).to(lens.center.device) for n in _GRID]
     grid = torch.cartesian_prod(*axes) * lens.image_size[:, None] - 0.5
     inside = lens.is_valid(grid)
-    known = step[:, : 2 + len(rich.powers)]
+    known = step[:, : 2 + len(lens.powers)]
     moved = (undistort_jacobian(lens, grid) @ known[:, None, :, None]).squeeze(-1)
-    own = problem.lens(*split(problem, state.theta)[:2])
     variance = own.displacement_sigma(grid, covariance) ** 2
     variance = torch.where(inside, variance, 0.0).nan_to_num(0.0)
     floor = _SMALLEST_SHARE**2 * variance.amax(1, keepdim=True)
     ratio = moved.square().sum(-1) / torch.maximum(variance, floor).clamp_min(1e-300)
     ratio = torch.where(inside, ratio, 0.0).amax(1)
-    return torch.where(clear & ratio.isfinite(), 1 + ratio, 1.0)
+    return torch.where(ratio.isfinite(), 1 + ratio, 1.0)
 
 
 def _with_more_powers(

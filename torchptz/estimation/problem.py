@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.compiled import LONGEST_LINE, chosen
 from torchptz.lens import RadialLens
 from torchptz.patterns import LinePatterns
 from torchptz.radial import powers_of
@@ -35,8 +37,11 @@ class Problem(Batched):
     powers: Tensor  # (K,)
     exponents: tuple[float, ...]  # the same as plain numbers
     gain_per_axis: bool = False
+    compiled: bool = False  # kernels do what they can; only on a CPU
 
-    _shared: ClassVar[frozenset[str]] = frozenset({"powers", "exponents", "gain_per_axis"})
+    _shared: ClassVar[frozenset[str]] = frozenset(
+        {"powers", "exponents", "gain_per_axis", "compiled"}
+    )
 
     @classmethod
     def from_patterns(
@@ -45,26 +50,39 @@ class Problem(Batched):
         powers: Tensor,
         pixel_aspect: Tensor | float = 1.0,
         gain_per_axis: bool = False,
+        backend: str = "auto",
     ) -> Problem:
         """In float64, whatever the patterns are in. Weights are 1/sigma² where sigmas are given.
 
         Points that are not finite, or whose sigma is no number above 0, are left out.
         """
-        points, offsets = patterns.points.double(), patterns.offsets
-        mask = patterns.mask & points.isfinite().all(-1)
-        if offsets is not None:
-            offsets = offsets.double()
-            mask = mask & offsets.isfinite().all(-1)
-            offsets = torch.where(mask.unsqueeze(-1), offsets, 0.0)
-        weight = mask.double()
-        if patterns.sigma is not None:
-            sigma = patterns.sigma.double()
-            weight = 1 / torch.where(mask, sigma, 1.0) ** 2
-            mask = mask & weight.isfinite() & (weight > 0) & (sigma > 0)
-            weight = torch.where(mask, weight, 0.0)
+        points = patterns.points.double()
+        offsets = None if patterns.offsets is None else patterns.offsets.double()
+        sigma = None if patterns.sigma is None else patterns.sigma.double()
+        compiled = chosen(backend, points.device) and points.shape[2] <= LONGEST_LINE
         size = patterns.image_size.double()
-        problem = cls(
-            points=torch.where(mask.unsqueeze(-1), points, size[:, None, None] / 2),
+        if compiled:
+            from torchptz.estimation import fused
+
+            mask, weight, clean = fused.prepare(
+                points, offsets, patterns.mask, sigma, FEWEST_POINTS
+            )
+        else:
+            mask = patterns.mask & points.isfinite().all(-1)
+            if offsets is not None:
+                mask = mask & offsets.isfinite().all(-1)
+            weight, clean = mask.double(), False
+            if sigma is not None:
+                weight = 1 / torch.where(mask, sigma, 1.0) ** 2
+                mask = mask & weight.isfinite() & (weight > 0) & (sigma > 0)
+                weight = torch.where(mask, weight, 0.0)
+            weight = _normalised(weight)
+        if not clean:  # what is not finite must not reach the arithmetic, masked or not
+            points = torch.where(mask.unsqueeze(-1), points, size[:, None, None] / 2)
+            if offsets is not None:
+                offsets = torch.where(mask.unsqueeze(-1), offsets, 0.0)
+        return cls(
+            points=points,
             mask=mask,
             weight=weight,
             offsets=offsets,
@@ -76,18 +94,16 @@ class Problem(Batched):
             powers=powers.to(size.device),
             exponents=tuple(powers.tolist()),
             gain_per_axis=gain_per_axis,
+            compiled=compiled,
         )
-        return problem.using(weight > 0)
 
     def using(self, inliers: Tensor) -> Problem:
         """The same problem with the points (B, L, P) bool only, weights renewed to mean 1."""
-        weight = torch.where(inliers, self.weight, 0.0)
-        # Fewer points are straight whatever the lens, and cost degrees of freedom.
-        enough = (weight > 0).sum(-1, keepdim=True) >= FEWEST_POINTS
-        weight = torch.where(enough, weight, 0.0)
-        count = (weight > 0).sum((1, 2), keepdim=True)
-        total = weight.sum((1, 2), keepdim=True)
-        return replace(self, weight=weight * torch.where(total > 0, count / total, 0.0))
+        if self.compiled:
+            from torchptz.estimation import fused
+
+            return replace(self, weight=fused.using(self.weight, inliers, FEWEST_POINTS))
+        return replace(self, weight=_normalised(torch.where(inliers, self.weight, 0.0)))
 
     def trimmed(self) -> Problem:
         """The same problem without lines and places that are padding in all items."""
@@ -145,12 +161,12 @@ class Problem(Batched):
             known[:, 2 + len(self.powers) :] = gains
         return known
 
-    @property
+    @cached_property
     def count(self) -> Tensor:
         """(B,) points used."""
         return (self.weight > 0).sum((1, 2))
 
-    @property
+    @cached_property
     def line_count(self) -> Tensor:
         """(B,) lines used."""
         return (self.weight > 0).any(-1).sum(-1)
@@ -201,3 +217,13 @@ class Problem(Batched):
         if gain is None or self.offsets is None:
             return corrected
         return corrected - gain.reshape(len(gain), 1, 1, -1) * self.offsets
+
+
+def _normalised(weight: Tensor) -> Tensor:
+    """Weights (B, L, P) with mean 1 over an item's points that have one."""
+    # Fewer points are straight whatever the lens, and cost degrees of freedom.
+    enough = (weight > 0).sum(-1, keepdim=True) >= FEWEST_POINTS
+    weight = torch.where(enough, weight, 0.0)
+    count = (weight > 0).sum((1, 2), keepdim=True)
+    total = weight.sum((1, 2), keepdim=True)
+    return weight * torch.where(total > 0, count / total, 0.0)

@@ -14,15 +14,25 @@ from torchptz.estimation.residuals import State, derivatives
 _ROUND = 5  # steps between two looks at which items are still active
 _DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST = 1e-3, 1e-15, 1e10
 # An undamped step's promised fall of the cost, relative to the noise variance, is its squared
-# length in standard deviations. An item is settled when that is next to rounding, ...
-_SETTLED = 1e-22
-# ... and good enough at a thousandth of a standard deviation, should it get stuck before.
+# length in standard deviations. Near its end an item's falls by about the same factor from step to
+# step. Below the first, a step is the last and needs no look at where it led, if the next one would
+# be below the second, and if it is short (in units of r, and of the coefficients).
+_NEAR, _LEFT, _SHORT = 1e-5, 1e-11, 1e-4
+# At this one an item is settled where it is.
+_SETTLED = 1e-16
+# Good enough, should an item get stuck before: a thousandth of a standard deviation.
 _CONVERGED = 1e-6
 # Of the half width. Residuals of exact points are not smaller, ...
 _ROUNDING = 1e-14
 _EXACT = 1e-12  # ... and these are exact.
 _SLACK = 1e-12  # relative, of the cost
 _FARTHEST_STEP = 0.2  # units of r, for the centre
+# All of them, as the compiled step wants them.
+RULES = (
+    *(_DAMPING_START, _DAMPING_LOWEST, _DAMPING_HIGHEST, _NEAR, _LEFT, _SHORT),
+    *(_SETTLED, _CONVERGED),
+    *(_ROUNDING, _EXACT, _SLACK, _FARTHEST_STEP),
+)
 _LINE_STEPS = 6
 
 
@@ -49,6 +59,7 @@ class Linearised(Batched):
     line_factor: Tensor  # (B, L, 3): lengths of a line's two columns and the part of one along both
     line_theta: Tensor  # (B, L, 2, M): columns of theta along the line's
     line_residual: Tensor  # (B, L, 2)
+    line_right: Tensor  # (B, L, M), each line's part of ``right``
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +69,7 @@ class Refined(Batched):
     state: State
     iterations: Tensor  # (B,) int, accepted and rejected steps alike
     converged: Tensor  # (B,) bool
+    linear: Linearised  # the problem there, or a negligible step before
 
 
 def linearise(problem: Problem, state: State) -> Linearised:
@@ -75,16 +87,17 @@ def linearise(problem: Problem, state: State) -> Linearised:
 
     Source: variable projection (Golub and Pereyra 1973; Kaufman 1975).
     """
-    return reduce_lines(problem, *derivatives(problem, state)[:3])[0]
+    if problem.compiled:
+        from torchptz.estimation import fused
+
+        return fused.linearise(problem, state)
+    return reduce_lines(problem, *derivatives(problem, state)[:3])
 
 
 def reduce_lines(
     problem: Problem, residual: Tensor, by_theta: Tensor, by_line: Tensor
-) -> tuple[Linearised, Tensor, Tensor]:
-    """`linearise` from the derivatives, with the projected columns (B, L, P, M) and residuals.
-
-    Columns of theta may be any columns: (B, L, P, M).
-    """
+) -> Linearised:
+    """`linearise` from the derivatives. Columns of theta may be any columns: (B, L, P, M)."""
     used = problem.weight > 0
     root = problem.weight.sqrt()
     tiny = torch.finfo(root.dtype).tiny
@@ -104,15 +117,16 @@ def reduce_lines(
     columns = columns - bases.mT @ line_theta
     residual = residual - (bases.mT @ line_residual.unsqueeze(-1)).squeeze(-1)
     flat = columns.flatten(1, 2)
-    linear = Linearised(
+    line_right = -(columns.mT @ residual.unsqueeze(-1)).squeeze(-1)
+    return Linearised(
         cost,
         flat.mT @ flat,
-        -(flat.mT @ residual.flatten(1).unsqueeze(-1)).squeeze(-1),
+        line_right.sum(1),
         torch.cat([shift_length, turn_length, along], -1),
         line_theta,
         line_residual,
+        line_right,
     )
-    return linear, columns, residual
 
 
 def refine(
@@ -141,6 +155,10 @@ def refine(
 
     Source: Levenberg and Marquardt; README, "Beyond the paper".
     """
+    if problem.compiled:
+        from torchptz.estimation import fused
+
+        return fused.refine(problem, state, free, prior, max_steps)
     progress = _Progress(
         state,
         linearise(problem, state),
@@ -148,6 +166,7 @@ def refine(
         torch.zeros_like(problem.scale, dtype=torch.long),
         torch.zeros_like(problem.scale, dtype=torch.bool),
         torch.ones_like(problem.scale, dtype=torch.bool),
+        torch.full_like(problem.scale, torch.inf),
     )
     for begun in range(0, max_steps, _ROUND):
         rows = progress.active.nonzero()[:, 0]
@@ -166,7 +185,7 @@ def refine(
             min(_ROUND, max_steps - begun),
         )
         progress = part if everyone else progress.with_items(rows, part)
-    return Refined(progress.state, progress.iterations, progress.converged)
+    return Refined(progress.state, progress.iterations, progress.converged, progress.linear)
 
 
 def settle_lines(problem: Problem, state: State) -> State:
@@ -177,12 +196,9 @@ def settle_lines(problem: Problem, state: State) -> State:
         state: lines near their optimum, such as total least squares lines.
     """
     for _ in range(_LINE_STEPS):
-        residual, _, by_line, _ = derivatives(problem, state)
-        nothing = residual.new_zeros(*residual.shape, 0)
-        linear, _, _ = reduce_lines(problem, residual, nothing, by_line)
-        still = state.theta.new_zeros(len(problem), 0)
-        step = _line_step(linear, still)
-        state = state.moved(State(torch.zeros_like(state.theta), step[..., 0], step[..., 1]))
+        still = torch.zeros_like(state.theta)
+        step = _line_step(linearise(problem, state), still)
+        state = state.moved(State(still, step[..., 0], step[..., 1]))
     return state
 
 
@@ -194,6 +210,7 @@ class _Progress(Batched):
     iterations: Tensor
     converged: Tensor
     active: Tensor
+    promised: Tensor  # in noise variances, by the last step
 
 
 def _advance(
@@ -213,7 +230,7 @@ def _advance(
         value = (linear.cost + problem.count * rounding).log()
         return value if prior is None else value + prior.value(state.theta) / freedom
 
-    level = merit(linear, state)
+    level, before = merit(linear, state), progress.promised
     for _ in range(steps):
         variance = linear.cost / freedom
         normal, right = linear.normal, linear.right
@@ -226,13 +243,22 @@ def _advance(
         # only because its damping is high does not pass for convergence.
         undamped = _solve_damped(normal, right, torch.zeros_like(damping), unit)
         promised = (right * undamped).sum(-1)
-        converged = promised <= _CONVERGED * variance + (_EXACT * problem.scale) ** 2
+        converged = torch.where(
+            active, promised <= _CONVERGED * variance + (_EXACT * problem.scale) ** 2, converged
+        )
         active = active & (promised > _SETTLED * variance + rounding)
+        promised = promised / variance.clamp_min(1e-300)
+        last = active & (promised <= _NEAR) & (promised.square() <= _LEFT * before)
+        before = promised
+        last &= ((undamped / unit).abs() <= _SHORT).all(-1)
         theta_step = _solve_damped(normal, right, damping, unit)
+        theta_step = torch.where(last[:, None], undamped, theta_step)
         length = torch.linalg.vector_norm(theta_step[:, :2], dim=-1).clamp_min(1e-300)
         theta_step = theta_step * (_FARTHEST_STEP * problem.scale / length).clamp(max=1.0)[:, None]
         line_step = _line_step(linear, theta_step)
         trial = state.moved(State(theta_step, line_step[..., 0], line_step[..., 1]))
+        state, active = trial.where(last, state), active & ~last
+        iterations, converged = iterations + last, converged | last
         trial_linear = linearise(problem, trial)
         trial_level = merit(trial_linear, trial)
         # Rounding must not decide whether the last steps count.
@@ -244,7 +270,7 @@ def _advance(
         level = torch.where(better, trial_level, level)
         damping = torch.where(better, damping / 10, damping * 10).clamp_min(_DAMPING_LOWEST)
         active = active & (damping < _DAMPING_HIGHEST)
-    return _Progress(state, linear, damping, iterations, converged, active)
+    return _Progress(state, linear, damping, iterations, converged, active, before)
 
 
 def masked(normal: Tensor, free: Tensor) -> Tensor:

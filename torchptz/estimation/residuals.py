@@ -26,6 +26,10 @@ class State(Batched):
     @classmethod
     def from_parameters(cls, problem: Problem, theta: Tensor) -> State:
         """With the total least squares lines of the corrected points."""
+        if problem.compiled:
+            from torchptz.estimation import fused
+
+            return fused.fit_lines(problem, theta)
         return cls.from_lines(
             problem, theta, fit_lines(problem.correct(*split(problem, theta)), problem.weight)
         )
@@ -124,6 +128,11 @@ def straightness(problem: Problem, state: State) -> Tensor:
 
     Source: Sampson's approximation; README, "The model, and conventions".
     """
+    inputs = (problem.points, problem.offsets, state.theta, state.angle, state.offset)
+    if problem.compiled and not any(one is not None and one.requires_grad for one in inputs):
+        from torchptz.estimation import fused
+
+        return fused.straightness(problem, state)
     terms = _terms(problem, state)
     return torch.where(problem.mask, terms.distance / terms.gradient, 0.0)
 

@@ -16,7 +16,8 @@ from torchptz.estimation.arcs import (
     neighbour_noise,
     on_arcs,
 )
-from torchptz.estimation.maximum_likelihood import start_from_loop
+from torchptz.estimation.center import idle
+from torchptz.estimation.maximum_likelihood import undistorted_start
 from torchptz.estimation.problem import FEWEST_POINTS, Problem
 from torchptz.estimation.refinement import refine
 from torchptz.estimation.residuals import State, straightness
@@ -32,8 +33,9 @@ _FAR_PENALTY = 4.0  # on their mean square: with a centre far off, few lines are
 _SUBSETS = 20  # of the lines tried as a start
 _SUBSET_SHARE = 0.4
 _TRUSTED_SHARE = 0.6  # of the lines, the straightest, that judge a start
-_LOOP_STEPS, _START_STEPS = 2, 5
+_START_STEPS = 8
 _REWEIGHTINGS, _WEIGHTED_STEPS = 12, 2
+_STEADY = 1e-3  # weights that change less are the last
 _BIWEIGHT = 4.685  # Tukey's, 95 % efficient
 _ROUNDS = 6
 _MOST_INLIERS = 0.7  # a fit that gives up more of the points than this leaves is not believed
@@ -55,29 +57,43 @@ def suspicious(problem: Problem, residual: Tensor, freedom: Tensor) -> Tensor:
         residual: (B, L, P) px, of the best fit to all points.
         freedom: (B,) degrees of freedom.
     """
-    whitened = residual * problem.weight.sqrt()
-    sigma = _sigma(whitened, problem.weight > 0, freedom)
+    median, largest, squares = spread(problem, residual)
+    sigma = _noise(median, problem.count, freedom)
     sigma = torch.maximum(sigma, FINEST * problem.scale)
     noise = torch.maximum(neighbour_noise(problem), FINEST * problem.scale)
-    within = (whitened.abs().amax((1, 2)) <= CUT * sigma) & (sigma <= _MISFIT * noise)
+    within = (largest <= CUT * sigma) & (sigma <= _MISFIT * noise)
     within &= sigma <= _ROUGH * problem.scale  # else even neighbours may be out of line
-    return ~within | bad_lines(problem.weight > 0, whitened, sigma[:, None]).any(-1)
+    points = (problem.weight > 0).sum(-1)
+    return ~within | bad_lines(points, squares, sigma[:, None]).any(-1)
 
 
-def bad_lines(used: Tensor, whitened: Tensor, sigma: Tensor) -> Tensor:
+def spread(problem: Problem, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How large residuals (B, L, P) px of the points used are, whitened: median (B,) and largest
+    (B,) of their amounts, each line's sum of squares (B, L)."""
+    if problem.compiled:
+        from torchptz.estimation import fused
+
+        return fused.spread(problem, residual)
+    used = problem.weight > 0
+    amounts = torch.where(used, residual * problem.weight.sqrt(), 0.0).abs()
+    median = masked_median(amounts.flatten(1), used.flatten(1))
+    largest = torch.nn.functional.pad(amounts.flatten(1), (0, 1)).amax(1)  # there may be none
+    return median, largest, amounts.square().sum(-1)
+
+
+def bad_lines(points: Tensor, squares: Tensor, sigma: Tensor) -> Tensor:
     """(B, L) bool: lines whose points as a whole are farther off than noise would have it.
 
     Args:
-        used: (B, L, P) bool.
-        whitened: (B, L, P) px, residuals.
+        points: (B, L) of each line.
+        squares: (B, L) px², sum over them of their whitened residuals squared.
         sigma: (B, L) or (B, 1) px, noise.
 
     Source: Wilson and Hilferty's approximation of the chi-squared quantile.
     """
-    freedom = (used.sum(-1) - 2).clamp_min(1)
+    freedom = (points - 2).clamp_min(1)
     spread = (2 / (9 * freedom)).sqrt()
     bound = freedom * (1 - spread**2 + CUT * spread) ** 3
-    squares = torch.where(used, whitened, 0.0).square().sum(-1)
     return squares > bound * sigma**2
 
 
@@ -115,7 +131,7 @@ def find_inliers(problem: Problem, center: Tensor) -> Inliers:
     started = on_arcs(problem)
     cleaned = problem.using(started)
     free = problem.known
-    state = start_from_loop(cleaned, center, free, _LOOP_STEPS)
+    state = undistorted_start(cleaned, center)
     state = refine(cleaned, state, free, max_steps=_START_STEPS).state
     inliers, found = _settle(problem, state, started)
     # Whole bad lines are left, and may have spoilt the start.
@@ -180,7 +196,7 @@ def _best_start(problem: Problem, center: Tensor) -> tuple[Tensor, Tensor]:
         subsets.reshape(many * batch, lines, 1).expand(-1, -1, copies.weight.shape[2])
     )
     free = chosen.known
-    state = start_from_loop(chosen, centers, free, _LOOP_STEPS)
+    state = undistorted_start(chosen, centers)
     state = refine(chosen, state, free, max_steps=_START_STEPS).state
     judged = State.from_parameters(copies, state.theta)
     whitened = straightness(copies, judged) * copies.weight.sqrt()
@@ -215,7 +231,8 @@ def _redescend(problem: Problem, state: State, started: Tensor) -> State:
     free = problem.known
     used = problem.weight > 0
     root = problem.weight.sqrt()
-    weighed = started
+    weighed, before = started, torch.zeros_like(root)
+    settled = torch.zeros_like(free[:, 0])
     for _ in range(_REWEIGHTINGS):
         whitened = straightness(problem, state) * root
         sigma = _sigma(whitened, weighed, weighed.sum((1, 2)))
@@ -223,9 +240,14 @@ def _redescend(problem: Problem, state: State, started: Tensor) -> State:
         scale = _line_sigma(whitened, weighed, sigma).unsqueeze(-1)
         share = (whitened / (_BIWEIGHT * scale)).clamp(-1, 1)
         loss = (1 - share**2) ** 2
-        weighed = used & (loss > 0)
+        settled = settled | ((loss - before).abs().amax((1, 2)) <= _STEADY)
+        if idle(~settled):
+            break
+        weighed = torch.where(settled[:, None, None], weighed, used & (loss > 0))
+        before = loss
         weighted = replace(problem, weight=problem.weight * loss)
-        state = refine(weighted, state, free, max_steps=_WEIGHTED_STEPS).state
+        moved = refine(weighted, state, free, max_steps=_WEIGHTED_STEPS).state
+        state = state.where(settled, moved)
     return state
 
 
@@ -238,7 +260,8 @@ def _within(problem: Problem, state: State, inliers: Tensor) -> Tensor:
     sigma = torch.maximum(sigma, FINEST * problem.scale)
     scale = _line_sigma(whitened, inliers, sigma)
     near = used & (whitened.abs() <= CUT * scale.unsqueeze(-1))
-    bad = bad_lines(near, whitened, scale)
+    squares = torch.where(near, whitened, 0.0).square().sum(-1)
+    bad = bad_lines(near.sum(-1), squares, scale)
     few = near.sum(-1) < ((used.sum(-1) + 1) // 2).clamp_min(FEWEST_POINTS)
     return near & ~(bad | few).unsqueeze(-1)
 
@@ -266,7 +289,11 @@ def _line_sigma(whitened: Tensor, used: Tensor, sigma: Tensor) -> Tensor:
 
 
 def _sigma(whitened: Tensor, used: Tensor, freedom: Tensor) -> Tensor:
-    """(B,) px, robust standard deviation: median of |residual|, for the degrees of freedom."""
-    count = used.sum((1, 2))
+    """(B,) px, robust standard deviation of residuals (B, L, P)."""
     median = masked_median(whitened.abs().flatten(1), used.flatten(1))
+    return _noise(median, used.sum((1, 2)), freedom)
+
+
+def _noise(median: Tensor, count: Tensor, freedom: Tensor) -> Tensor:
+    """(B,) px, standard deviation from the median of |residual|, for the degrees of freedom."""
     return median / NORMAL_MEDIAN * (count / freedom.clamp_min(1)).sqrt()

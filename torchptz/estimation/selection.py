@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.refinement import Refined, settle_lines
+from torchptz.estimation.refinement import Refined, linearise, settle_lines
 from torchptz.estimation.residuals import State, straightness
 from torchptz.estimation.robust import RICH
 from torchptz.estimation.solution import (
@@ -87,7 +87,7 @@ def solve_with_best_powers(
     choice = choose_powers(problem, search, solver)
     problem = problem.with_powers(UNION)
     blank = State.from_parameters(problem, problem.scale.new_zeros(len(problem), problem.unknowns))
-    refined = Refined(blank, torch.zeros_like(choice), torch.zeros_like(outlying))
+    state, iterations, converged = blank, torch.zeros_like(choice), torch.zeros_like(outlying)
     free = torch.zeros_like(blank.theta, dtype=torch.bool)
     gains = range(2 + len(UNION), problem.unknowns)
     for number, powers in enumerate(CANDIDATES):
@@ -98,10 +98,13 @@ def solve_with_best_powers(
         columns = torch.tensor(
             [0, 1, *(2 + UNION.index(power) for power in powers), *gains], device=rows.device
         )
-        state = part.refined.state
-        theta = blank.theta[rows].index_copy(1, columns, state.theta)
+        found = part.refined
+        theta = blank.theta[rows].index_copy(1, columns, found.state.theta)
         free[rows] = free[rows].index_copy(1, columns, part.free)
-        refined = refined.with_items(rows, replace(part.refined, state=replace(state, theta=theta)))
+        state = state.with_items(rows, replace(found.state, theta=theta))
+        iterations = iterations.index_copy(0, rows, found.iterations)
+        converged = converged.index_copy(0, rows, found.converged)
+    refined = Refined(state, iterations, converged, linearise(problem, state))
     return problem, replace(as_solution(problem, refined, free), outlying=outlying)
 
 

@@ -128,11 +128,12 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
         outlying=inliers.doubtful,
         misfit=again.known.rms > MISFIT_LIMIT * inliers.rms,
     )
-    return problem.with_items(rows, cleaned), solution.with_items(rows, again)
+    weight = problem.weight.index_copy(0, rows, cleaned.weight)
+    return replace(problem, weight=weight), solution.with_items(rows, again)
 
 
 def as_solution(problem: Problem, refined: Refined, free: Tensor) -> Solution:
     """With what is known at the end of a search."""
     nothing = torch.zeros_like(free[:, 0])
-    known = from_residuals(problem, refined.state, free)
+    known = from_residuals(problem, refined.state, free, refined.linear)
     return Solution(refined, known, free, nothing, nothing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -55,24 +56,32 @@ class Status(Enum):
     NOT_CONVERGED = "the iteration did not converge: look at the points, or allow more iterations"
 
 
-def too_few(used: Tensor, unknowns: Tensor) -> Tensor:
-    """(B,) bool: fewer degrees of freedom than unknowns (B,), or lines in too few places.
+class Used(NamedTuple):
+    """How many points, on how many lines, of B items."""
 
-    Args:
-        used: (B, L, P) bool, points.
-        unknowns: (B,) beside the lines.
-    """
-    lines = used.any(-1).sum(-1)
-    return (lines < 3) | (used.sum((1, 2)) - 2 * lines - unknowns < 1)
+    points: Tensor  # (B,)
+    lines: Tensor  # (B,)
+
+    @classmethod
+    def of(cls, used: Tensor) -> Used:
+        """Of a mask (B, L, P) bool."""
+        of_line = used.sum(-1, dtype=torch.int32)
+        return cls(of_line.sum(-1), (of_line > 0).sum(-1))
+
+    def too_few(self, unknowns: Tensor) -> Tensor:
+        """(B,) bool: fewer degrees of freedom than unknowns (B,) beside the lines, or lines in too
+        few places."""
+        return (self.lines < 3) | (self.points - 2 * self.lines - unknowns < 1)
 
 
 def center_sigma(covariance: Tensor) -> Tensor:
     """(B,) px, standard deviation of the centre in its least known direction."""
     block = covariance[:, :2, :2]
     known = block.isfinite().all((1, 2))
-    safe = torch.where(known[:, None, None], block, 0.0)
-    largest = torch.linalg.eigvalsh(safe)[:, -1].clamp_min(0).sqrt()
-    return torch.where(known, largest, torch.inf)
+    # In closed form: as a batch of decompositions, it would cost more than all the rest.
+    (xx, _), (xy, yy) = (row.unbind(-1) for row in block.unbind(1))
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    return torch.where(known, largest.clamp_min(0).sqrt(), torch.inf)
 
 
 def center_unobservable(
@@ -89,11 +98,21 @@ def center_unobservable(
     count = coefficients.shape[1]
     block = covariance[:, 2 : 2 + count, 2 : 2 + count]
     known = block.isfinite().all((1, 2)) & coefficients.isfinite().all(1)
-    safe = torch.where(known[:, None, None], block, torch.eye(count).to(block))
-    solved = torch.linalg.solve_ex(safe, coefficients.unsqueeze(-1)).result.squeeze(-1)
-    seen = known & ((coefficients * solved).sum(-1) > SEEN_LIMIT * count)
+    seen = known & (_significance(coefficients, block) > SEEN_LIMIT * count)
     limit = torch.where(converged, CENTER_SIGMA_LIMIT, FLAT_CENTER_SIGMA) * scale
     return ~seen | (center_sigma(covariance) > limit)
+
+
+def _significance(values: Tensor, covariance: Tensor) -> Tensor:
+    """(B,) ``v' C^-1 v`` of values (B, K), by elimination."""
+    rest, matrix, total = values, covariance, 0.0
+    for _ in range(values.shape[1]):
+        first, pivot = rest[:, :1], matrix[:, :1, 0]
+        total = total + first[:, 0] ** 2 / pivot[:, 0]
+        factor = matrix[:, 1:, 0] / pivot
+        rest = rest[:, 1:] - factor * first
+        matrix = matrix[:, 1:, 1:] - factor.unsqueeze(-1) * matrix[:, :1, 1:]
+    return total
 
 
 def border_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
@@ -104,13 +123,13 @@ def border_sigma(lens: RadialLens, covariance: Tensor) -> Tensor:
     border = share.to(lens.center) * lens.image_size[:, None] - 0.5
     # Beyond a fold there is no picture: as far as it goes.
     away = border - lens.center[:, None]
-    distance = (lens.radius(border) * lens.scale[:, None]).clamp_min(1e-9)
-    reach = (0.99 * lens.valid_radius[:, None] / distance).clamp(max=1.0)
-    border = lens.center[:, None] + reach[..., None] * away
+    reach = (0.99 * lens.fold[:, None] / lens.radius(border).clamp_min(1e-12)).clamp(max=1.0)
+    away = reach[..., None] * away
+    border = lens.center[:, None] + away
     sigma = lens.displacement_sigma(border, covariance, part="lines")
     moved = lens.undistort(border) - lens.center[:, None]
     stretch = torch.linalg.vector_norm(moved, dim=-1) / (
-        torch.linalg.vector_norm(border - lens.center[:, None], dim=-1).clamp_min(1e-9)
+        torch.linalg.vector_norm(away, dim=-1).clamp_min(1e-9)
     )
     return (sigma / stretch.clamp_min(1.0)).amax(-1)
 
@@ -143,35 +162,25 @@ def judge(
     Returns:
         B members of Status.
     """
+    every, used = Used.of(problem.mask), Used.of(problem.weight > 0)
     inlier_share = torch.minimum(
-        problem.count / problem.mask.sum((1, 2)).clamp_min(1),
-        problem.line_count / problem.mask.any(-1).sum(-1).clamp_min(1),
+        used.points / every.points.clamp_min(1), used.lines / every.lines.clamp_min(1)
     )
+    sigma = border_sigma(lens, covariance)
+    moved, other = sigma.clone(), (grown != covariance).any(-1).any(-1).nonzero()[:, 0]
+    if len(other):
+        moved[other] = border_sigma(lens[other], grown[other])
+    known = sigma <= BORDER_SIGMA_LIMIT * lens.scale
     reasons = [
-        (Status.TOO_FEW_LINES, too_few(problem.mask, unknowns)),
-        (
-            Status.OUTLIERS,
-            outlying | ((problem.count > 0) & (inlier_share < INLIER_SHARE_LIMIT)),
-        ),
-        (Status.TOO_FEW_LINES, too_few(problem.weight > 0, unknowns)),
-        (
-            Status.MISFIT,
-            misfit
-            | (
-                (border_sigma(lens, grown) > MISFIT_BORDER_LIMIT * lens.scale)
-                & (border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale)
-            ),
-        ),
-        (
-            Status.DISTORTION_UNOBSERVABLE,
-            ~(border_sigma(lens, covariance) <= BORDER_SIGMA_LIMIT * lens.scale),
-        ),
+        (Status.TOO_FEW_LINES, every.too_few(unknowns)),
+        (Status.OUTLIERS, outlying | ((used.points > 0) & (inlier_share < INLIER_SHARE_LIMIT))),
+        (Status.TOO_FEW_LINES, used.too_few(unknowns)),
+        (Status.MISFIT, misfit | ((moved > MISFIT_BORDER_LIMIT * lens.scale) & known)),
+        (Status.DISTORTION_UNOBSERVABLE, ~known),
         (Status.NOT_CONVERGED, ~converged),
         (Status.NOT_MONOTONIC, lens.valid_radius < lens.farthest_corner()),
         (Status.CENTER_UNOBSERVABLE, held),
+        (Status.OK, torch.ones_like(converged)),
     ]
-    statuses = [Status.OK] * len(lens)
-    for status, applies in reversed(reasons):
-        flags = applies.tolist()
-        statuses = [status if flag else old for flag, old in zip(flags, statuses, strict=True)]
-    return statuses
+    first = torch.stack([applies for _, applies in reasons]).int().argmax(0)
+    return [reasons[i][0] for i in first.tolist()]

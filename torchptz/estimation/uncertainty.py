@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
-from torchptz.estimation.refinement import Linearised, Prior, masked, reduce_lines
+from torchptz.estimation.refinement import Linearised, Prior, linearise, masked, reduce_lines
 from torchptz.estimation.residuals import State, derivatives, straightness
 
 # Standard deviations by which residuals must hang together before they are believed to.
@@ -33,26 +33,28 @@ class Uncertainty(Batched):
         return (self.inflation * self.rms.square()).clamp_min(1e-300)[:, None, None]
 
 
-def from_residuals(problem: Problem, state: State, free: Tensor) -> Uncertainty:
+def from_residuals(
+    problem: Problem, state: State, free: Tensor, linear: Linearised | None = None
+) -> Uncertainty:
     """Noise level from the residuals, covariance from their derivatives.
 
     Args:
         problem: B items.
         state: at the solution.
         free: (B, M) bool; the rows of the others are 0.
+        linear: the problem there, where it is known already.
 
     Returns:
         Uncertainty.
 
     Source: Gauss-Newton approximation of the information, with the lines eliminated.
     """
-    linear, columns, residual = reduce_lines(problem, *derivatives(problem, state)[:3])
+    linear = linearise(problem, state) if linear is None else linear
     freedom = _freedom(problem, free)
     rms = _rms(linear.cost, freedom)
     normal = masked(linear.normal, free)
     inverse, failed = _inverse(normal)
-    scores = (columns.mT @ residual.unsqueeze(-1)).squeeze(-1) * free[:, None]  # (B, L, M)
-    inflation = _inflation(problem, scores, inverse, rms, free)
+    inflation = _inflation(problem, linear.line_right * free[:, None], inverse, rms, free)
     unknown = failed | (freedom <= 0)
     identity = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
     # Exact points are known no better than their numbers are written.
@@ -174,7 +176,7 @@ def systematic_covariance(
     normal = torch.stack([state.angle.cos(), state.angle.sin()], -1)[:, :, None, :, None]
     shift = (normal * displacements).sum(-2) / gradient.unsqueeze(-1)
     count = by_theta.shape[-1]
-    linear, _, _ = reduce_lines(problem, residual, torch.cat([by_theta, shift], -1), by_line)
+    linear = reduce_lines(problem, residual, torch.cat([by_theta, shift], -1), by_line)
     matrix = linear.normal[:, :count, :count]
     if prior is not None:
         matrix = matrix + known.rms.square()[:, None, None] * prior.information

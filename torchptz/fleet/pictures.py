@@ -1,8 +1,13 @@
-"""Picture files: finding, reading, writing, and rectifying many of them."""
+"""Picture files: finding, reading, writing; rectifying many of them, and streams of frames.
+
+Decoding, resampling and encoding are compiled; as many threads as there are cores take a picture
+each through all three, see `pipeline`. What bounds them is the cores' arithmetic.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,15 +15,16 @@ import cv2
 import numpy as np
 
 from torchptz.files import write_whole
+from torchptz.fleet.pipeline import in_order
 from torchptz.lens import RadialLens
-from torchptz.rectification import rectify
+from torchptz.rectification import Canvas, rectify
 from torchptz.zoom_table import ZoomTable
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
 
-_JPEG_START = b"\xff\xd8\xff"
+_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 # Bits of no particular meaning: long and varied enough to decode to something visible.
-_FILLER = bytes(range(1, 251)) + b"\xff\xd9"
+_FILLER = bytes(range(1, 251)) + _JPEG_END
 
 
 class UnreadablePicture(ValueError):
@@ -60,8 +66,9 @@ def read_picture(path: str | Path, *, grey: bool = False) -> np.ndarray:
     if picture is None:
         raise UnreadablePicture("is no picture that can be read")
     # The decoder fills what is missing with grey and says nothing. Only where something is missing
-    # does it go on to use bits that are added at the end.
-    if data.startswith(_JPEG_START):
+    # does it go on to use bits that are added at the end. The end marker is no part of coded
+    # pixels: a file that ends with it has them all, and need not be decoded twice.
+    if data.startswith(_JPEG_START) and not data.endswith(_JPEG_END):
         longer = _decode(data + _FILLER, flags | cv2.IMREAD_IGNORE_ORIENTATION)
         if not np.array_equal(picture, longer):
             raise UnreadablePicture("is cut off: a part of the picture is missing")
@@ -92,6 +99,7 @@ def rectify_pictures(
     canvas: str = "same",
     extrapolate: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    workers: int | None = None,
 ) -> RectifiedPictures:
     """Rectify picture files into a folder, under their own names and in their own formats.
 
@@ -103,29 +111,74 @@ def rectify_pictures(
         zoom_units: or the zoom in the device's own units. Neither: a table of one zoom has no
             other.
         canvas, extrapolate: as for `rectify` and `ZoomTable.at`.
-        progress: called with how many are done, and of how many.
+        progress: called with how many are done, and of how many, in the order of the pictures.
+        workers: pictures that are worked on, and in memory, at once; default as for `in_order`.
 
     Returns:
-        RectifiedPictures; a picture that fails stops no other.
+        RectifiedPictures, in the order of the pictures; a picture that fails stops no other.
 
     Raises:
         ValueError: what is wrong with the call as a whole: no pictures, no such zoom, an output
             that would overwrite an input or another output.
+
+    An interrupt waits for the pictures that are being worked on; no file is ever half written.
     """
     lens = _lens(table, zoom, zoom_units, extrapolate)
     inputs = _expanded(pictures)
     targets = _targets(inputs, Path(out))
     Path(out).mkdir(parents=True, exist_ok=True)
-    written, failed = [], {}
-    for done, (path, target) in enumerate(zip(inputs, targets, strict=True)):
-        progress(done, len(inputs))
+
+    def one(pair: tuple[Path, Path]) -> str | None:
+        """Rectify one file into another; what went wrong."""
+        path, target = pair
         try:
             write_picture(target, rectify(read_picture(path), lens, canvas=canvas))
-            written.append(target)
         except (OSError, ValueError) as error:
-            failed[path] = getattr(error, "strerror", None) or str(error)
-    progress(len(inputs), len(inputs))
+            return getattr(error, "strerror", None) or str(error)
+        except Exception as error:  # a defect of ours, which should say where it happened
+            error.add_note(f"while rectifying {path}")
+            raise
+        return None
+
+    written, failed = [], {}
+    pairs = list(zip(inputs, targets, strict=True))
+    progress(0, len(pairs))
+    with closing(in_order(one, pairs, workers=workers)) as results:
+        for done, ((path, target), reason) in enumerate(zip(pairs, results, strict=True), 1):
+            if reason is None:
+                written.append(target)
+            else:
+                failed[path] = reason
+            progress(done, len(pairs))
     return RectifiedPictures(tuple(written), failed)
+
+
+def rectify_stream(
+    frames: Iterable[np.ndarray],
+    lens: RadialLens,
+    canvas: str | Canvas = "same",
+    mode: str = "bilinear",
+    *,
+    workers: int | None = None,
+) -> Iterator[np.ndarray]:
+    """Frames of a video or of a camera, rectified one by one, in their order.
+
+    Taking a frame from ``frames`` (decoding it), rectifying others and whatever is done with the
+    results (encoding them) go on at the same time. At most twice as many frames as workers are
+    taken ahead; each must have memory of its own.
+
+    Args:
+        frames: (H, W) or (H, W, C); may be endless.
+        lens, canvas, mode: as for `rectify`; one lens.
+        workers: threads; default as for `in_order`.
+
+    Yields:
+        What `rectify` makes of each frame.
+
+    Raises:
+        ValueError: as `rectify`, in the frame's turn; fewer than one worker.
+    """
+    return in_order(lambda frame: rectify(frame, lens, canvas, mode), frames, workers=workers)
 
 
 def _lens(

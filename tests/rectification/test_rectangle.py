@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchptz.rectangle import largest_rectangle
+from torchptz.rectification.rectangle import largest_rectangle
 
 
 def largest_area_by_trying(mask):

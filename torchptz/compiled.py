@@ -1,0 +1,92 @@
+"""Compiled kernels on a CPU: run over a batch, by slices of it, on as many threads as torch has.
+
+A kernel is a function that numba compiles once and keeps on disk. It works on one item after the
+other: what an item needs fits the first cache of a core, where the same steps written in torch send
+every intermediate of the batch through memory. Kernels release the interpreter, so that plain
+threads run them side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from importlib.util import find_spec
+
+import numpy as np
+import torch
+from torch import Tensor
+
+BACKENDS = ("auto", "torch", "numba")
+# Of every kernel. Sums may be reordered, which makes them vector sums; NaN and infinity keep their
+# meaning.
+OPTIONS = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
+}
+LONGEST_LINE = 1056  # points of a line that kernels have room for
+_SLICES = 8  # of a batch per thread: items differ in how long they take
+
+
+def chosen(backend: str, device: torch.device) -> bool:
+    """Whether kernels are to be used: "auto" means where they can be.
+
+    Raises:
+        ValueError: an unknown backend, or "numba" where it cannot be used.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, not {backend!r}")
+    if backend == "numba" and device.type != "cpu":
+        raise ValueError(f"backend 'numba' is for a CPU, the tensors are on {device}: use 'auto'")
+    there = _numba()
+    if backend == "numba" and not there:
+        raise ValueError("backend 'numba' needs the package numba: install it, or use 'auto'")
+    return backend != "torch" and device.type == "cpu" and there
+
+
+@cache
+def _numba() -> bool:
+    return find_spec("numba") is not None
+
+
+def in_reach_of_kernels(*tensors: Tensor) -> bool:
+    """Whether kernels can take these: on a CPU, in float64, with memory of their own, which what
+    passes through a transform of `torch.func` has not."""
+    try:
+        for tensor in tensors:
+            tensor.untyped_storage()
+    except NotImplementedError:
+        return False
+    return all(t.dtype == torch.float64 and chosen("auto", t.device) for t in tensors)
+
+
+def arrays(*tensors: Tensor) -> list[np.ndarray]:
+    """Contiguous arrays that share the memory of CPU tensors where these are contiguous."""
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+
+
+def run(kernel: Callable[..., None], count: int, *arguments: object) -> None:
+    """Call ``kernel(begin, end, *arguments)`` for slices that make up ``range(count)``.
+
+    Args:
+        kernel: works on items ``begin`` to ``end`` and writes into arrays among its arguments.
+        count: items.
+        arguments: as the kernel wants them.
+    """
+    threads = min(torch.get_num_threads(), count)
+    if threads <= 1:
+        kernel(0, count, *arguments)
+        return
+    step = -(-count // (_SLICES * threads))
+    slices = [(begin, min(begin + step, count)) for begin in range(0, count, step)]
+    pool = _pool(threads, os.getpid())
+    for done in [pool.submit(kernel, *one, *arguments) for one in slices]:
+        done.result()
+
+
+@cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads of this process: a fork has none of its parent's."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="torchptz")
