@@ -39,8 +39,11 @@ def with_blocks(text: str, reports: list[dict]) -> str:
     """A README's text with the block of every report replaced.
 
     Raises:
-        ValueError: markers that are missing, or there twice; see `block`.
+        ValueError: markers that are missing, or there twice; two reports of a command; see `block`.
     """
+    commands = [report["command"] for report in reports]
+    if len(set(commands)) < len(commands):
+        raise ValueError("two files hold figures of one command: measure its sections in one run")
     for report in reports:
         opening, closing = (
             marker.format(command=report["command"]) for marker in (OPENING, CLOSING)

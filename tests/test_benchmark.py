@@ -223,6 +223,16 @@ class TestReadme:
         assert (code, after) == (1, text)
         assert reason in output
 
+    def test_two_files_of_one_command(self, put, benchmark, tmp_path):
+        put({"one": section()})
+        twice = 2 * ["--json", str(tmp_path / "report.json")]
+        readme = tmp_path / "README.md"
+        before = readme.read_text(encoding="utf-8")
+        result = CliRunner().invoke(benchmark.main, ["readme", *twice, "--readme", str(readme)])
+        assert result.exit_code == 1
+        assert "one command" in result.output
+        assert readme.read_text(encoding="utf-8") == before
+
     def test_a_file_without_figures(self, benchmark, tmp_path):
         for content in ("[]", "{}", "not JSON"):
             (tmp_path / "figures.json").write_text(content)

@@ -9,14 +9,17 @@ threads run them side by side.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib.util import find_spec
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
+
+Part, Result = TypeVar("Part"), TypeVar("Result")
 
 BACKENDS = ("auto", "torch", "numba")
 # Of every kernel. Sums may be reordered, which makes them vector sums; NaN and infinity keep their
@@ -26,6 +29,9 @@ OPTIONS = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz", "arcp"},
 }
+# A line whose points are in one place has no direction: what is left of the column of its turn when
+# that of its shift is taken out is rounding, this part of it at most (squared).
+ONE_PLACE = 1e-26
 LONGEST_LINE = 1056  # points of a line that kernels have room for
 _SLICES = 8  # of a batch per thread: items differ in how long they take
 
@@ -84,6 +90,29 @@ def run(kernel: Callable[..., None], count: int, *arguments: object) -> None:
     pool = _pool(threads, os.getpid())
     for done in [pool.submit(kernel, *one, *arguments) for one in slices]:
         done.result()
+
+
+def side_by_side(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """``function`` of every part, in their order, on as many threads as torch has.
+
+    Torch itself works on one thread meanwhile. Its own threads wait for each other after every
+    operation, awake: as soon as a machine has anything else to do, that takes longer than the work.
+    """
+    threads = min(torch.get_num_threads(), len(parts))
+    if threads <= 1:
+        return [function(part) for part in parts]
+    all_threads, gradients = torch.get_num_threads(), torch.is_grad_enabled()
+
+    def alone(part: Part) -> Result:
+        torch.set_num_threads(1)  # of this thread, and of those that begin from now on
+        with torch.set_grad_enabled(gradients):
+            return function(part)
+
+    try:
+        begun = [_pool(threads, os.getpid()).submit(alone, part) for part in parts]
+        return [one.result() for one in begun]
+    finally:
+        torch.set_num_threads(all_threads)
 
 
 @cache

@@ -167,7 +167,7 @@ def _along_lines(problem: Problem) -> tuple[Tensor, Tensor]:
 
     spread = (quantile(0.75) - quantile(0.25)).nan_to_num(0.0)
     steep = (spread[..., 1] > spread[..., 0]).unsqueeze(-1)
-    order = torch.where(steep, points[..., 1], points[..., 0]).argsort(-1)
+    order = torch.where(steep, points[..., 1], points[..., 0]).argsort(dim=-1, stable=True)
     return points.gather(2, order.unsqueeze(-1).expand_as(points)), order
 
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
-from torchptz.compiled import chosen
-from torchptz.estimation.buckets import buckets
+from torchptz.compiled import chosen, side_by_side
+from torchptz.estimation.buckets import Bucket, buckets
 from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.implicit import differentiable
 from torchptz.estimation.maximum_likelihood import maximise
@@ -36,6 +36,7 @@ METHODS = ("ml", "lanz")
 # give or take so much of its width.
 _VAGUE_CENTER = 0.1
 _CHUNK = 2**20  # points solved at a time, padding counted
+_LEAST = 2**16  # points for which another thread is worth its while
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ def estimate(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there is {', '.join(METHODS)}")
-    chosen(backend, patterns.points.device)  # before anything else can fail
+    compiled = chosen(backend, patterns.points.device)
     if method == "lanz" and patterns.points.requires_grad:
         raise ValueError(
             'gradients are those of the optimum that method "ml" finds; detach the points'
@@ -176,18 +177,20 @@ def estimate(
         raise ValueError("pixel_aspect must be positive")
     # Not all at once: what does not fit the caches is slow, and what does not fit the memory fails.
     most = _CHUNK // (len(CANDIDATES) if choose else 1)
+    threads = torch.get_num_threads() if compiled else 1
+    shape = patterns.mask.shape[1:]
+    size = max(1, shape.numel() * len(patterns))
+    if threads > 1 and size >= threads * _LEAST:
+        most = min(most, -(-size // threads))
     parts = buckets(patterns.mask, most)
     if len(parts) == 1:
         return fit(patterns, aspect, search)
-    shape = patterns.mask.shape[1:]
-    fits = [
-        fit(
-            patterns[part.rows].trimmed(part.lines, part.places),
-            aspect[part.rows],
-            search[part.rows],
-        )._padded(*shape)
-        for part in parts
-    ]
+
+    def fit_part(part: Bucket) -> Fit:
+        own = patterns[part.rows].trimmed(part.lines, part.places)
+        return fit(own, aspect[part.rows], search[part.rows])._padded(*shape)
+
+    fits = side_by_side(fit_part, parts) if compiled else [fit_part(part) for part in parts]
     order = torch.cat([part.rows for part in parts])
     return Fit.cat(fits)[order.argsort()]
 
@@ -260,6 +263,9 @@ def _as_fit(
     if any(one is not None and one.requires_grad for one in (problem.points, problem.offsets)):
         state = differentiable(problem, state, free, prior)
         rms = rms_of(problem, state, free)
+    residual = solution.residual
+    if residual is None or state.theta.requires_grad:
+        residual = straightness(problem, state)
     center, coefficients, gain = split(problem, state.theta)
     gain_sigma = None
     if gain is not None:
@@ -270,7 +276,7 @@ def _as_fit(
     return Fit(
         lens=problem.lens(center, coefficients),
         rms_px=rms,
-        residuals=straightness(problem, state),
+        residuals=residual,
         inliers=problem.weight > 0,
         iterations=solution.refined.iterations,
         covariance=(grown * covariance)[:, :size, :size],

@@ -86,6 +86,21 @@ def spread(problem: Problem, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return median, largest, squares
 
 
+def line_sigma(
+    problem: Problem,
+    residual: Tensor,
+    used: Tensor,
+    freedom: Tensor,
+    finest: Tensor,
+    rules: tuple[float, int, int, float],
+) -> Tensor:
+    """`robust.line_sigma` by a kernel."""
+    sigma = problem.scale.new_empty(problem.weight.shape[:2])
+    given = arrays(problem.weight, residual, used, freedom, finest)
+    run(noise.line_sigma, len(problem), *given, rules, sigma.numpy())
+    return sigma
+
+
 def using(weight: Tensor, inliers: Tensor, fewest: int) -> Tensor:
     """The weights of `Problem.using` by a kernel."""
     renewed = torch.empty_like(weight, memory_format=torch.contiguous_format)

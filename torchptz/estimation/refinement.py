@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
+from torchptz.compiled import ONE_PLACE
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.residuals import State, derivatives
 
@@ -109,8 +110,11 @@ def reduce_lines(
     first = shift / shift_length
     along = (first * turn).sum(-1, keepdim=True)
     second = turn - along * first
-    turn_length = (second**2).sum(-1, keepdim=True).clamp_min(tiny).sqrt()
-    bases = torch.stack([first, second / turn_length], -2)  # (B, L, 2, P)
+    squared = (second**2).sum(-1, keepdim=True)
+    turns = squared > ONE_PLACE * (turn**2).sum(-1, keepdim=True)
+    turn_length = torch.where(turns, squared.clamp_min(tiny).sqrt(), 0.0)
+    second = torch.where(turns, second / turn_length.clamp_min(tiny), 0.0)
+    bases = torch.stack([first, second], -2)  # (B, L, 2, P)
     line_theta = bases @ columns
     line_residual = (bases @ residual.unsqueeze(-1)).squeeze(-1)
     cost = (residual**2).sum((1, 2))

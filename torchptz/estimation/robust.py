@@ -234,11 +234,9 @@ def _redescend(problem: Problem, state: State, started: Tensor) -> State:
     weighed, before = started, torch.zeros_like(root)
     settled = torch.zeros_like(free[:, 0])
     for _ in range(_REWEIGHTINGS):
-        whitened = straightness(problem, state) * root
-        sigma = _sigma(whitened, weighed, weighed.sum((1, 2)))
-        sigma = torch.maximum(sigma, FINEST * problem.scale)
-        scale = _line_sigma(whitened, weighed, sigma).unsqueeze(-1)
-        share = (whitened / (_BIWEIGHT * scale)).clamp(-1, 1)
+        residual = straightness(problem, state)
+        scale = line_sigma(problem, residual, weighed, weighed.sum((1, 2))).unsqueeze(-1)
+        share = (residual * root / (_BIWEIGHT * scale)).clamp(-1, 1)
         loss = (1 - share**2) ** 2
         settled = settled | ((loss - before).abs().amax((1, 2)) <= _STEADY)
         if idle(~settled):
@@ -254,11 +252,10 @@ def _redescend(problem: Problem, state: State, started: Tensor) -> State:
 def _within(problem: Problem, state: State, inliers: Tensor) -> Tensor:
     """(B, L, P) bool: points within the cut of their lines, bad lines left out."""
     used = problem.weight > 0
-    whitened = straightness(problem, state) * problem.weight.sqrt()
+    residual = straightness(problem, state)
+    whitened = residual * problem.weight.sqrt()
     freedom = inliers.sum((1, 2)) - 2 * inliers.any(-1).sum(-1) - problem.unknowns
-    sigma = _sigma(whitened, inliers, freedom)
-    sigma = torch.maximum(sigma, FINEST * problem.scale)
-    scale = _line_sigma(whitened, inliers, sigma)
+    scale = line_sigma(problem, residual, inliers, freedom)
     near = used & (whitened.abs() <= CUT * scale.unsqueeze(-1))
     squares = torch.where(near, whitened, 0.0).square().sum(-1)
     bad = bad_lines(near.sum(-1), squares, scale)
@@ -266,22 +263,36 @@ def _within(problem: Problem, state: State, inliers: Tensor) -> Tensor:
     return near & ~(bad | few).unsqueeze(-1)
 
 
-def _line_sigma(whitened: Tensor, used: Tensor, sigma: Tensor) -> Tensor:
+def line_sigma(problem: Problem, residual: Tensor, used: Tensor, freedom: Tensor) -> Tensor:
     """(B, L) px, noise of each line: at least the item's, at most what its other lines have too.
 
     Real lines are not all alike: strings sag, boards bend, lenses do not quite follow the model. A
     line is not wrong for being two times as rough as the next, where others are as well.
+
+    Args:
+        problem: B items.
+        residual: (B, L, P) px.
+        used: (B, L, P) bool, the points that tell.
+        freedom: (B,) their degrees of freedom.
     """
+    finest = FINEST * problem.scale
+    if problem.compiled:
+        from torchptz.estimation import fused
+
+        rules = (NORMAL_MEDIAN, _TELLING_POINTS, _TELLING_LINES, _EXCESS)
+        return fused.line_sigma(problem, residual, used, freedom, finest, rules)
+    whitened = residual * problem.weight.sqrt()
+    sigma = torch.maximum(_sigma(whitened, used, freedom), finest)
     count = used.sum(-1)
-    freedom = (count - 2).clamp_min(1)
+    rest = (count - 2).clamp_min(1)
     median = masked_median(whitened.abs(), used) / NORMAL_MEDIAN
-    own = median * (count / freedom).sqrt()
+    own = median * (count / rest).sqrt()
     told = (count >= _TELLING_POINTS) & (own > 0)
     level = torch.where(told, own, 1.0).log()
     away = (level - masked_median(level, told)[:, None]).abs()
     spread = masked_median(away, told) / NORMAL_MEDIAN
     # What a median of so many points scatters by itself.
-    chance = masked_median(1.35 / freedom, told)
+    chance = masked_median(1.35 / rest, told)
     excess = (spread**2 - chance).clamp_min(0).sqrt()
     excess = torch.where(told.sum(-1) >= _TELLING_LINES, excess, 0.0)
     highest = sigma * (_EXCESS * excess).exp()

@@ -35,6 +35,7 @@ class Solution(Batched):
     free: Tensor  # (B, M) bool, parameters that were estimated
     outlying: Tensor  # (B,) bool, the points do not lie on lines
     misfit: Tensor  # (B,) bool, other powers straighten them much better
+    residual: Tensor | None = None  # (B, L, P) px, of the points' straightness, where it was needed
 
     @property
     def held(self) -> Tensor:
@@ -104,7 +105,7 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
     residual = straightness(problem, solution.refined.state)
     rows = suspicious(problem, residual, freedom).nonzero()[:, 0]
     if len(rows) == 0:
-        return problem, solution
+        return problem, replace(solution, residual=residual)
     # Not at the cost of the padding that other items need.
     items = problem[rows].trimmed()
     inliers = Inliers.cat(
@@ -129,7 +130,9 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
         misfit=again.known.rms > MISFIT_LIMIT * inliers.rms,
     )
     weight = problem.weight.index_copy(0, rows, cleaned.weight)
-    return replace(problem, weight=weight), solution.with_items(rows, again)
+    residual = residual.index_copy(0, rows, straightness(cleaned, again.refined.state))
+    solution = replace(solution.with_items(rows, again), residual=residual)
+    return replace(problem, weight=weight), solution
 
 
 def as_solution(problem: Problem, refined: Refined, free: Tensor) -> Solution:

@@ -43,8 +43,12 @@ def _select(values, count, rank):
 
 @inlined
 def _sort(n, key, x, y, root):
-    """``n`` points by their key; as a rule they are in order already, or in the opposite one."""
-    if n > 1 and key[0] > key[n - 1]:
+    """``n`` points by their key, where alike as they were; as a rule they are in order already, or
+    in the opposite one."""
+    falling = 0
+    for p in range(1, n):
+        falling += key[p] < key[p - 1]
+    if falling == n - 1:
         for p in range(n // 2):
             q = n - 1 - p
             key[p], key[q], x[p], x[q] = key[q], key[p], x[q], x[p]
@@ -143,3 +147,62 @@ def spread(begin, end, weight, residual, median, largest, squares):
             most = max(most, amounts[p])
         median[i] = _select(amounts, found, (found - 1) // 2) if found > 0 else 0.0
         largest[i] = math.nan if bad else most
+
+
+@inlined
+def _median(values, count):
+    """The lower median of ``count`` values; 0 of none, and where it is not finite."""
+    median = _select(values, count, (count - 1) // 2) if count > 0 else 0.0
+    return median if math.isfinite(median) else 0.0
+
+
+@kernel
+def line_sigma(begin, end, weight, residual, used, freedom, finest, rules, sigma):
+    """`robust.line_sigma` of items ``begin`` to ``end``.
+
+    Args:
+        weight: (B, L, P).
+        residual: (B, L, P) px.
+        used: (B, L, P) bool.
+        freedom: (B,) degrees of freedom.
+        finest: (B,) px.
+        rules: the constants of `robust`: of |x| for a unit normal x the median, points that tell of
+            a line, lines that tell of how lines differ, standard deviations.
+        sigma: (B, L) px, to be filled.
+    """
+    normal_median, telling_points, telling_lines, most_excess = rules
+    lines, places = weight.shape[1:]
+    every, here = np.empty(lines * places), np.empty(places)
+    level, away, chance = np.empty(lines), np.empty(lines), np.empty(lines)
+    for i in range(begin, end):
+        found, told = 0, 0
+        for line in range(lines):
+            count = 0
+            for p in range(places):
+                if used[i, line, p]:
+                    amount = abs(residual[i, line, p]) * math.sqrt(weight[i, line, p])
+                    here[count] = amount if amount < math.inf else math.inf
+                    every[found] = here[count]
+                    count += 1
+                    found += 1
+            rest = max(count - 2, 1)
+            own = _median(here, count) / normal_median * math.sqrt(count / rest)
+            sigma[i, line] = own
+            if count >= telling_points and own > 0:
+                level[told] = math.log(own)
+                chance[told] = 1.35 / rest
+                told += 1
+        whole = _median(every, found) / normal_median * math.sqrt(found / max(freedom[i], 1))
+        whole = max(whole, finest[i])
+        excess = 0.0
+        if told >= telling_lines:
+            away[:told] = level[:told]
+            middle = _median(away, told)
+            for line in range(told):
+                away[line] = abs(level[line] - middle)
+            spread = _median(away, told) / normal_median
+            # What a median of so many points scatters by itself.
+            excess = math.sqrt(max(spread * spread - _median(chance, told), 0.0))
+        highest = whole * math.exp(most_excess * excess)
+        for line in range(lines):
+            sigma[i, line] = min(max(sigma[i, line], whole), highest)

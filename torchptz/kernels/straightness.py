@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchptz.compiled import LONGEST_LINE
+from torchptz.compiled import LONGEST_LINE, ONE_PLACE
 from torchptz.kernels.decorators import compiled, inlined, kernel
 
 _ROW = LONGEST_LINE + 8  # no multiple of a page: rows would compete for the same places of a cache
@@ -235,26 +235,35 @@ def _eliminate(n, s, columns, to):
     """
     to = max(to, 0)
     shift_shift, shift_turn, turn_turn = 0.0, 0.0, 0.0
-    shift_residual, turn_residual, cost = 0.0, 0.0, 0.0
+    shift_residual, cost = 0.0, 0.0
     for p in range(n):
         shift_shift += s[_SHIFT + p] * s[_SHIFT + p]
         shift_turn += s[_SHIFT + p] * s[_TURN + p]
         turn_turn += s[_TURN + p] * s[_TURN + p]
         shift_residual += s[_SHIFT + p] * s[_RESIDUAL + p]
-        turn_residual += s[_TURN + p] * s[_RESIDUAL + p]
         cost += s[_RESIDUAL + p] * s[_RESIDUAL + p]
     shift_length = math.sqrt(max(shift_shift, _TINY))
-    along = shift_turn / shift_length
-    turn_length = math.sqrt(max(turn_turn - along * along, _TINY))
-    per_shift, per_turn = 1 / shift_length, 1 / turn_length
-    by_shift = shift_residual * per_shift
-    by_turn = (turn_residual - along * by_shift) * per_turn
+    per_shift = 1 / shift_length
+    along, by_shift = shift_turn * per_shift, shift_residual * per_shift
+    squared, by_turn = 0.0, 0.0
     for p in range(n):
         shift = s[_SHIFT + p] * per_shift
-        turn = (s[_TURN + p] - along * shift) * per_turn
+        turn = s[_TURN + p] - along * shift
+        residual = s[_RESIDUAL + p] - by_shift * shift
+        squared += turn * turn
+        by_turn += turn * residual
         s[_SHIFT + p] = shift
         s[_TURN + p] = turn
-        s[_RESIDUAL + p] -= by_shift * shift + by_turn * turn
+        s[_RESIDUAL + p] = residual
+    turn_length, per_turn = 0.0, 0.0
+    if squared > ONE_PLACE * turn_turn:
+        turn_length = math.sqrt(squared)
+        per_turn = 1 / turn_length
+    by_turn *= per_turn
+    for p in range(n):
+        turn = s[_TURN + p] * per_turn
+        s[_TURN + p] = turn
+        s[_RESIDUAL + p] -= by_turn * turn
     for p in range(n):
         columns[to + p] = s[_RESIDUAL + p]
     return shift_length, turn_length, along, by_shift, by_turn, cost
@@ -419,15 +428,19 @@ def fit_lines_of_item(data, i, state, at, room):
     theta = state.theta[at]
     metric_y = 1 / (data.scale[i] * data.scale[i])
     metric_x = data.aspect[i] * data.aspect[i] * metric_y
+    distorted = False
+    for k in range(count):
+        distorted = distorted or theta[2 + k] != 0
     for line in range(data.weight.shape[1]):
         n = _see(line, theta[0], theta[1], data.gains, room)
         state.angle[at, line], state.offset[at, line] = 0, 0
         if n == 0:
             continue
-        _correction(n, theta, data.powers, metric_x, metric_y, s)
-        for p in range(n):
-            s[_X + p] *= s[_CORRECTION + p]
-            s[_Y + p] *= s[_CORRECTION + p]
+        if distorted:
+            _correction(n, theta, data.powers, metric_x, metric_y, s)
+            for p in range(n):
+                s[_X + p] *= s[_CORRECTION + p]
+                s[_Y + p] *= s[_CORRECTION + p]
         if data.gains > 0:
             gx, gy = theta[2 + count], theta[1 + count + data.gains]
             for p in range(n):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from torchptz.kernels.decorators import inlined, kernel
+from torchptz.kernels.decorators import exactly, kernel
 
 _FAR = 1e6  # px: powers of what is farther off overflow sooner or later
 
 
-@inlined
+@exactly  # else padding would decide in which order weights are added, and so their last digits
 def _normalise(weight, fewest):
     """Weights (L, P) of an item to mean 1 over its points; lines of fewer points than a line needs
     lose theirs."""
