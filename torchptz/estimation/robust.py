@@ -67,6 +67,21 @@ def suspicious(problem: Problem, residual: Tensor, freedom: Tensor) -> Tensor:
     return ~within | bad_lines(points, squares, sigma[:, None]).any(-1)
 
 
+def within_cut(problem: Problem, residual: Tensor, told: Tensor, unknowns: Tensor) -> Tensor:
+    """(B, L, P) bool: points used that are within the cut of what others scatter.
+
+    Args:
+        problem: B items.
+        residual: (B, L, P) px.
+        told: (B, L, P) bool, the points that tell of the noise.
+        unknowns: (B,) of the fit beside the lines.
+    """
+    whitened = residual * problem.weight.sqrt()
+    freedom = told.sum((1, 2)) - 2 * told.any(-1).sum(-1) - unknowns
+    sigma = torch.maximum(_sigma(whitened, told, freedom), FINEST * problem.scale)
+    return (problem.weight > 0) & (whitened.abs() <= CUT * sigma[:, None, None])
+
+
 def spread(problem: Problem, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """How large residuals (B, L, P) px of the points used are, whitened: median (B,) and largest
     (B,) of their amounts, each line's sum of squares (B, L)."""

@@ -12,7 +12,7 @@ from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined
 from torchptz.estimation.residuals import straightness
-from torchptz.estimation.robust import Inliers, find_inliers, suspicious
+from torchptz.estimation.robust import Inliers, find_inliers, suspicious, within_cut
 from torchptz.estimation.status import MISFIT_LIMIT, center_unobservable
 from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 
@@ -20,6 +20,7 @@ from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 # head's readings are worth. Where poses leave the offsets next to no variation, as at the long end,
 # a free gain runs away and takes the lens along.
 GAIN_SIGMA = 0.3
+_FEW = 0.02  # of the points: so few are tried to be left out before anything is searched for
 _CHUNK = 2**16  # points looked at for outliers at a time: many starts are tried of each
 
 # (problem, centre to start from, free parameters, prior) -> where the search ended
@@ -100,39 +101,97 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
     Returns:
         The problem, of the inliers only, and its solution.
     """
-    solution = solve(problem, search, solver)
-    freedom = problem.count - 2 * problem.line_count - solution.free.sum(-1)
+    solution = _with_residual(problem, solve(problem, search, solver))
+    rows = _suspicious(problem, solution).nonzero()[:, 0]
+    if len(rows):
+        settled, cleaned, again = _set_few_aside(
+            problem[rows], search[rows], solver, solution[rows]
+        )
+        problem, solution = _replaced(problem, solution, rows, settled, cleaned, again)
+        rows = rows[~settled]
+    if len(rows):
+        cleaned, again = _search(problem[rows], search[rows], solver)
+        everyone = torch.ones_like(rows, dtype=torch.bool)
+        problem, solution = _replaced(problem, solution, rows, everyone, cleaned, again)
+    return problem, solution
+
+
+def _set_few_aside(
+    problem: Problem, search: Search, solver: Solver, solution: Solution
+) -> tuple[Tensor, Problem, Solution]:
+    """Try whether leaving out the few points that are far off leaves nothing to suspect.
+
+    Args:
+        problem: B items.
+        search: of their centres.
+        solver: as for `solve`.
+        solution: to all of their points.
+
+    Returns:
+        (B,) bool, where it does: with the new solution the very same points are far off. And the
+        problem of the others, and its solution.
+    """
+    used = problem.weight > 0
+    near = within_cut(problem, solution.residual, used, solution.free.sum(-1))
+    few = (used & ~near).sum((1, 2)) <= _FEW * problem.count
+    cleaned = problem.using(near)
+    solution = solve(cleaned, search, solver)
     residual = straightness(problem, solution.refined.state)
-    rows = suspicious(problem, residual, freedom).nonzero()[:, 0]
-    if len(rows) == 0:
-        return problem, replace(solution, residual=residual)
+    solution = replace(solution, residual=residual)
+    left = cleaned.weight > 0
+    same = within_cut(problem, residual, left, solution.free.sum(-1)) == left
+    settled = few & same.all((1, 2)) & ~_suspicious(cleaned, solution)
+    return settled, cleaned, solution
+
+
+def _search(problem: Problem, search: Search, solver: Solver) -> tuple[Problem, Solution]:
+    """The inliers wherever they are, and the solution to them."""
     # Not at the cost of the padding that other items need.
-    items = problem[rows].trimmed()
-    inliers = Inliers.cat(
-        [
-            find_inliers(items[part], search.start[rows][part])
-            for part in torch.arange(len(rows), device=rows.device).split(
-                max(1, _CHUNK // max(1, items.mask.shape[1:].numel()))
-            )
-        ]
-    )
+    items = problem.trimmed()
+    step = max(1, _CHUNK // max(1, items.mask.shape[1:].numel()))
+    parts = [slice(begun, begun + step) for begun in range(0, len(items), step)]
+    inliers = Inliers.cat([find_inliers(items[part], search.start[part]) for part in parts])
     _, lines, places = problem.mask.shape
     _, some_lines, some_places = items.mask.shape
     padding = (0, places - some_places, 0, lines - some_lines)
     mask = torch.nn.functional.pad(inliers.mask, padding)
-    cleaned, near = problem[rows].using(mask), search[rows]
+    cleaned = problem.using(mask)
     # From where the lens was looked for, or where the inliers were found, whichever is better.
-    tries = [solve(cleaned, replace(near, start=s), solver) for s in (near.start, inliers.center)]
+    starts = (search.start, inliers.center)
+    tries = [solve(cleaned, replace(search, start=start), solver) for start in starts]
     again = tries[0].where(~(tries[1].known.rms < tries[0].known.rms), tries[1])
     again = replace(
         again,
         outlying=inliers.doubtful,
         misfit=again.known.rms > MISFIT_LIMIT * inliers.rms,
     )
-    weight = problem.weight.index_copy(0, rows, cleaned.weight)
-    residual = residual.index_copy(0, rows, straightness(cleaned, again.refined.state))
-    solution = replace(solution.with_items(rows, again), residual=residual)
-    return replace(problem, weight=weight), solution
+    return cleaned, _with_residual(problem, again)
+
+
+def _suspicious(problem: Problem, solution: Solution) -> Tensor:
+    """(B,) bool; see `suspicious`."""
+    freedom = problem.count - 2 * problem.line_count - solution.free.sum(-1)
+    return suspicious(problem, solution.residual, freedom)
+
+
+def _with_residual(problem: Problem, solution: Solution) -> Solution:
+    return replace(solution, residual=straightness(problem, solution.refined.state))
+
+
+def _replaced(
+    problem: Problem,
+    solution: Solution,
+    rows: Tensor,
+    chosen: Tensor,
+    cleaned: Problem,
+    again: Solution,
+) -> tuple[Problem, Solution]:
+    """The same with those items of ``rows`` that are ``chosen`` as they are now."""
+    rows, kept = rows[chosen], chosen.nonzero()[:, 0]
+    if len(rows) == 0:
+        return problem, solution
+    weight = problem.weight.index_copy(0, rows, cleaned.weight[kept])
+    return replace(problem, weight=weight), solution.with_items(rows, again[kept])
 
 
 def as_solution(problem: Problem, refined: Refined, free: Tensor) -> Solution:
