@@ -238,3 +238,7 @@ class TestBackend:
             numbers(estimate(short, robust=False, backend=one)) for one in ("numba", "torch")
         )
         torch.testing.assert_close(kernels, plain, rtol=1e-7, atol=1e-9)
+
+    def test_of_no_items_is_no_fit(self, patterns):
+        for backend in BACKENDS:
+            assert len(estimate(patterns[:0], backend=backend)) == 0

@@ -22,16 +22,9 @@ from torch import Tensor
 Part, Result = TypeVar("Part"), TypeVar("Result")
 
 BACKENDS = ("auto", "torch", "numba")
-# Of every kernel. Sums may be reordered, which makes them vector sums; NaN and infinity keep their
-# meaning.
-OPTIONS = {
-    "nogil": True,
-    "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "nsz", "arcp"},
-}
 # A line whose points are in one place has no direction: what is left of the column of its turn when
 # that of its shift is taken out is rounding, this part of it at most (squared).
-ONE_PLACE = 1e-26
+ONE_PLACE = 1e-16
 LONGEST_LINE = 1056  # points of a line that kernels have room for
 _SLICES = 8  # of a batch per thread: items differ in how long they take
 

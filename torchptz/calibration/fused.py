@@ -7,11 +7,13 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 
-from torchptz.calibration import normal_kernel, prediction_kernel, stop_kernels
 from torchptz.calibration.marginal import Metric, Noise, Normal
 from torchptz.calibration.model import Prediction
 from torchptz.calibration.problem import Problem
 from torchptz.compiled import arrays, run
+from torchptz.kernels import normal as normal_kernel
+from torchptz.kernels import prediction as prediction_kernel
+from torchptz.kernels import stops
 
 
 def predict(problem: Problem, theta: Tensor, derivatives: bool) -> Prediction:
@@ -41,7 +43,7 @@ def metric_of(problem: Problem, by_pose: Tensor, noise: Noise) -> Metric:
     precision, weight = new(problem.weight.shape), new(len(problem), problem.stops)
     answer, information, inner = new(3, *weight.shape, 2, 2)
     run(
-        *(stop_kernels.metric_of, len(problem)),
+        *(stops.metric_of, len(problem)),
         tuple(arrays(problem.weight, problem.sigma, problem.stop, by_pose)),
         tuple(arrays(noise.head, noise.pixel)),
         *arrays(precision, information, answer, inner, weight),
@@ -53,7 +55,7 @@ def cost(problem: Problem, metric: Metric, residual: Tensor) -> Tensor:
     """`marginal.cost` by a kernel."""
     out = residual.new_empty(len(residual))
     looks = _looks(problem, metric)
-    run(stop_kernels.cost, len(problem), looks, *arrays(metric.inner, residual, out))
+    run(stops.cost, len(problem), looks, *arrays(metric.inner, residual, out))
     return out
 
 
@@ -84,7 +86,7 @@ def noise_sums(
     found, seen = torch.empty_like(noise.head), torch.empty_like(noise.head)
     crossed = residual.new_empty(len(residual), 2, 2)
     run(
-        *(stop_kernels.noise_sums, len(problem), _looks(problem, metric)),
+        *(stops.noise_sums, len(problem), _looks(problem, metric)),
         tuple(arrays(metric.answer, metric.information, metric.stop_weight)),
         *arrays(noise.head, residual, found, seen, crossed),
     )

@@ -26,6 +26,8 @@ def neighbour_noise(problem: Problem) -> Tensor:
         from torchptz.estimation import fused
 
         return fused.neighbour_noise(problem, _shifted_points(problem)) / NORMAL_MEDIAN
+    if problem.weight.shape[2] == 0:
+        return torch.zeros_like(problem.scale)
     ordered, order = _along_lines(problem)
     root = problem.weight.sqrt().gather(2, order)
     before, point, after = ordered[:, :, :-2], ordered[:, :, 1:-1], ordered[:, :, 2:]

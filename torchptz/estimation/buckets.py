@@ -30,6 +30,8 @@ def buckets(mask: Tensor, most: int) -> list[Bucket]:
     Returns:
         Buckets that hold every item once; at least one.
     """
+    if len(mask) == 0:
+        return [Bucket(torch.arange(0, device=mask.device), *mask.shape[1:])]
     lines, places = _extent(mask.any(2)), _extent(mask.any(1))
     parts = []
     for rows in _by_size(torch.stack([lines, places], 1)):

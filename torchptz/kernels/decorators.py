@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 from numba import njit
@@ -41,8 +42,13 @@ def _kept(function: Callable, options: dict) -> Callable:
     return dispatcher
 
 
+# What kernels take constants from, beside their own package.
+SOURCES = ("compiled.py", "calibration/model.py", "calibration/parameters.py")
+
+
+@cache
 def _digest() -> str:
     """Of all sources that end up in kernels."""
     package = Path(__file__).parent
-    sources = sorted(package.glob("*.py")) + [package.parent / "compiled.py"]
+    sources = sorted(package.glob("*.py")) + [package.parent / name for name in SOURCES]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()

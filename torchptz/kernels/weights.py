@@ -13,22 +13,28 @@ _FAR = 1e6  # px: powers of what is farther off overflow sooner or later
 def _normalise(weight, fewest):
     """Weights (L, P) of an item to mean 1 over its points; lines of fewer points than a line needs
     lose theirs."""
-    count, total = 0, 0.0
+    count, uneven = 0, 0
     for line in range(weight.shape[0]):
-        n, of_line = 0, 0.0
+        n = 0
         for p in range(weight.shape[1]):
             n += weight[line, p] > 0
-            of_line += weight[line, p]
         if n < fewest:
-            weight[line, :] = 0
+            for p in range(weight.shape[1]):
+                weight[line, p] = 0.0
         else:
             count += n
-            total += of_line
-    if total > 0 and total != count:
-        factor = count / total
-        for line in range(weight.shape[0]):
             for p in range(weight.shape[1]):
-                weight[line, p] *= factor
+                uneven += weight[line, p] > 0 and weight[line, p] != 1
+    if uneven == 0:
+        return
+    total = 0.0
+    for line in range(weight.shape[0]):
+        for p in range(weight.shape[1]):
+            total += weight[line, p]
+    factor = count / total
+    for line in range(weight.shape[0]):
+        for p in range(weight.shape[1]):
+            weight[line, p] *= factor
 
 
 @kernel

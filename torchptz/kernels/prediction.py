@@ -14,7 +14,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from torchptz.calibration import parameters as at
 from torchptz.calibration.model import (
@@ -24,7 +23,7 @@ from torchptz.calibration.model import (
     NEWTON_STEPS,
     SMALLEST_RADIUS,
 )
-from torchptz.compiled import OPTIONS
+from torchptz.kernels.decorators import inlined, kernel
 
 _STILL = 2e-15  # of a radius: a step that is rounding
 _MOST_FACTORS = 8.0
@@ -49,14 +48,14 @@ class Looks(NamedTuple):
     scale: np.ndarray  # (C,)
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _between(value, low, high):
     """A value within bounds; NaN stays NaN."""
     value = low if value < low else value
     return high if value > high else value
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _factors(powers, out):
     """How many radii lead from a power to the next; 0: pow does."""
     reached = 0.0
@@ -66,7 +65,7 @@ def _factors(powers, out):
         reached = powers[k]
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _monomials(radius, powers, factors, out):
     """`radial.powers_of` of one radius."""
     last = 1.0
@@ -78,7 +77,7 @@ def _monomials(radius, powers, factors, out):
         out[k] = last
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _pushed(load, slope, motor, half):
     """A load and its slope by the play after the motor's move; ties as in `backlash`."""
     low, high = motor - half, motor + half
@@ -93,7 +92,7 @@ def _pushed(load, slope, motor, half):
     return load, slope
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _turned(turn, x, y, z):
     """Rz(roll) Ry(boresight) of a vector; sine and cosine of each in ``turn``."""
     sin_l, cos_l, sin_r, cos_r = turn
@@ -101,7 +100,7 @@ def _turned(turn, x, y, z):
     return cos_r * x - sin_r * y, sin_r * x + cos_r * y, z
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _put(out, column, lens, dx, dy):
     """A column of the derivatives: a move of the undistorted picture through the lens."""
     xx, xy, yx, yy = lens
@@ -109,13 +108,13 @@ def _put(out, column, lens, dx, dy):
     out[1, column] = yx * dx + yy * dy
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _in_picture(pull, aspect, u, v, dx, dy, dz):
     """Undistorted px of a move of the feature in the camera's frame."""
     return pull * (dx - u * dz), pull * aspect * (dy - v * dz)
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _about(seen, ax, ay, az):
     """The same of a turn about an axis of the camera's frame."""
     pull, aspect, u, v, x, y, z = seen
@@ -123,7 +122,7 @@ def _about(seen, ax, ay, az):
     return _in_picture(pull, aspect, u, v, dx, dy, dz)
 
 
-@njit(cache=True, **OPTIONS)
+@kernel
 def predict(begin, end, looks, theta, derivatives, pixel, by_theta, by_pose):
     """`model.predict` of cameras ``begin`` to ``end``.
 

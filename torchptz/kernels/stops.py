@@ -8,19 +8,18 @@ nanoseconds, bound by both.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from torchptz.compiled import OPTIONS
+from torchptz.kernels.decorators import inlined, kernel
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _inverse(a, b, c, d):
     """Of a (2, 2) matrix, row by row."""
     determinant = a * d - b * c
     return d / determinant, -b / determinant, -c / determinant, a / determinant
 
 
-@njit(cache=True, **OPTIONS)
+@kernel
 def metric_of(begin, end, looks, noise, precision, information, answer, inner, stop_weight):
     """`marginal.metric_of` of cameras ``begin`` to ``end``.
 
@@ -57,7 +56,7 @@ def metric_of(begin, end, looks, noise, precision, information, answer, inner, s
                 inner[c, s, 0, j], inner[c, s, 1, j] = pan * out[0, j], tilt * out[1, j]
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _pull(looks, c, residual, pull):
     """B^T D^-1 of a camera's residuals (N, 2) into (S, 2); what D^-1 alone makes of them."""
     precision, stop, by_pose = looks
@@ -74,7 +73,7 @@ def _pull(looks, c, residual, pull):
     return plain
 
 
-@njit(cache=True, **OPTIONS)
+@kernel
 def cost(begin, end, looks, inner, residual, out):
     """`marginal.cost` of cameras ``begin`` to ``end``.
 
@@ -93,7 +92,7 @@ def cost(begin, end, looks, inner, residual, out):
             out[c] -= tilt * (q[1, 0] * pan + q[1, 1] * tilt)
 
 
-@njit(cache=True, **OPTIONS)
+@kernel
 def noise_sums(begin, end, looks, stops, head, residual, found, seen, crossed):
     """`marginal.noise_sums` of cameras ``begin`` to ``end``.
 

@@ -12,10 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from torchptz.calibration import parameters as at
-from torchptz.compiled import OPTIONS
+from torchptz.kernels.decorators import compiled, inlined, kernel
 
 _HEAD, _FEATURE = len(at.HEAD), len(at.FEATURE)
 _ROOM = 64  # looks that are worked on at a time
@@ -51,7 +50,7 @@ class Places(NamedTuple):
     new_stop: np.ndarray  # (C, H)
 
 
-@njit(**OPTIONS)
+@compiled
 def _add_products(left, right, count, out):
     """Add the first ``count`` products of rows (W, ...) to (W, W), of which the lower triangle.
 
@@ -77,7 +76,7 @@ def _add_products(left, right, count, out):
                     out[k, m] += km
 
 
-@njit(**OPTIONS)
+@compiled
 def _of_looks(linear, places, c, z, begin, learn, rows, away):
     """Weigh looks of a zoom from number ``begin`` on, as many as there is room for; their number.
 
@@ -123,7 +122,7 @@ def _of_looks(linear, places, c, z, begin, learn, rows, away):
     return count
 
 
-@njit(**OPTIONS)
+@compiled
 def _into(out, block, z, own, first):
     """Add a zoom's (W, W) block to (T, T), lower triangles of both."""
     start = z * own
@@ -132,7 +131,7 @@ def _into(out, block, z, own, first):
     out[first:, first:] += block[own:, own:]
 
 
-@njit(**OPTIONS)
+@compiled
 def _shared_stops(linear, places, c, learn, matrix, right, reach):
     """Take out what stops with several looks take of them."""
     size, count = len(right), places.stop.shape[1]
@@ -174,7 +173,7 @@ def _shared_stops(linear, places, c, learn, matrix, right, reach):
             _add_products(poses[axis], poses[axis], count, reach[axis])
 
 
-@njit(inline="always", **OPTIONS)
+@inlined
 def _mirror(matrix):
     """The lower triangle into the upper one."""
     for i in range(len(matrix)):
@@ -182,7 +181,7 @@ def _mirror(matrix):
             matrix[j, i] = matrix[i, j]
 
 
-@njit(cache=True, **OPTIONS)
+@kernel
 def normal_of(begin, end, linear, places, learn, matrix, right, reach):
     """`marginal.normal_of` of cameras ``begin`` to ``end``.
 
