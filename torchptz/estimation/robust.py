@@ -38,6 +38,7 @@ _REWEIGHTINGS, _WEIGHTED_STEPS = 12, 2
 _STEADY = 1e-3  # weights that change less are the last
 _BIWEIGHT = 4.685  # Tukey's, 95 % efficient
 _ROUNDS = 6
+_FEW = 0.02  # of the points: so few are tried to be left out before anything is searched for
 _MOST_INLIERS = 0.7  # a fit that gives up more of the points than this leaves is not believed
 _TELLING_POINTS, _TELLING_LINES = 5, 6  # fewer say nothing of how lines differ
 _EXCESS = 3.0  # standard deviations
@@ -120,6 +121,32 @@ class Inliers(Batched):
     center: Tensor  # (B, 2) px, of the lens that went with it, to start from
     rms: Tensor  # (B,) px, that it left
     doubtful: Tensor  # (B,) bool: even so, the points do not lie on lines
+
+
+def confirm(problem: Problem, near: Tensor, center: Tensor) -> tuple[Inliers, Tensor]:
+    """Inliers that are obvious: all but a few points, if nothing else is to be suspected then.
+
+    Args:
+        problem: B items.
+        near: (B, L, P) bool, the points that are not far off.
+        center: (B, 2) px, where the centre starts.
+
+    Returns:
+        Inliers, and (B,) bool, whether a lens of powers enough to follow any finds the very same
+        points far off, and few of them, and nothing odd about the others.
+    """
+    problem = problem.with_powers(RICH)
+    chosen = problem.using(near)
+    state = refine(chosen, undistorted_start(chosen, center), chosen.known).state
+    residual = straightness(chosen, state)
+    left = chosen.weight > 0
+    unknowns = torch.full_like(chosen.count, problem.unknowns)
+    same = (within_cut(problem, residual, left, unknowns) == left).all((1, 2))
+    few = chosen.count >= (1 - _FEW) * problem.count
+    freedom = chosen.count - 2 * chosen.line_count - unknowns
+    variance = (chosen.weight * residual**2).sum((1, 2)) / freedom.clamp_min(1)
+    inliers = Inliers(left, state.theta[:, :2], variance.sqrt(), torch.zeros_like(few))
+    return inliers, few & same & ~suspicious(chosen, residual, freedom)
 
 
 def find_inliers(problem: Problem, center: Tensor) -> Inliers:

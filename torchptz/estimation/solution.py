@@ -12,7 +12,7 @@ from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined
 from torchptz.estimation.residuals import straightness
-from torchptz.estimation.robust import Inliers, find_inliers, suspicious, within_cut
+from torchptz.estimation.robust import Inliers, confirm, find_inliers, suspicious, within_cut
 from torchptz.estimation.status import MISFIT_LIMIT, center_unobservable
 from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 
@@ -20,7 +20,7 @@ from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 # head's readings are worth. Where poses leave the offsets next to no variation, as at the long end,
 # a free gain runs away and takes the lens along.
 GAIN_SIGMA = 0.3
-_FEW = 0.02  # of the points: so few are tried to be left out before anything is searched for
+_BETTER = 1 - 1e-6
 _CHUNK = 2**16  # points looked at for outliers at a time: many starts are tried of each
 
 # (problem, centre to start from, free parameters, prior) -> where the search ended
@@ -102,7 +102,8 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
         The problem, of the inliers only, and its solution.
     """
     solution = _with_residual(problem, solve(problem, search, solver))
-    rows = _suspicious(problem, solution).nonzero()[:, 0]
+    freedom = problem.count - 2 * problem.line_count - solution.free.sum(-1)
+    rows = suspicious(problem, solution.residual, freedom).nonzero()[:, 0]
     if len(rows):
         settled, cleaned, again = _set_few_aside(
             problem[rows], search[rows], solver, solution[rows]
@@ -119,7 +120,7 @@ def solve_robustly(problem: Problem, search: Search, solver: Solver) -> tuple[Pr
 def _set_few_aside(
     problem: Problem, search: Search, solver: Solver, solution: Solution
 ) -> tuple[Tensor, Problem, Solution]:
-    """Try whether leaving out the few points that are far off leaves nothing to suspect.
+    """What leaving out the few points that are far off leads to.
 
     Args:
         problem: B items.
@@ -128,20 +129,14 @@ def _set_few_aside(
         solution: to all of their points.
 
     Returns:
-        (B,) bool, where it does: with the new solution the very same points are far off. And the
-        problem of the others, and its solution.
+        (B,) bool, whether it leaves nothing to suspect. And the problem of the other points, and
+        its solution.
     """
-    used = problem.weight > 0
-    near = within_cut(problem, solution.residual, used, solution.free.sum(-1))
-    few = (used & ~near).sum((1, 2)) <= _FEW * problem.count
-    cleaned = problem.using(near)
-    solution = solve(cleaned, search, solver)
-    residual = straightness(problem, solution.refined.state)
-    solution = replace(solution, residual=residual)
-    left = cleaned.weight > 0
-    same = within_cut(problem, residual, left, solution.free.sum(-1)) == left
-    settled = few & same.all((1, 2)) & ~_suspicious(cleaned, solution)
-    return settled, cleaned, solution
+    near = within_cut(problem, solution.residual, problem.weight > 0, solution.free.sum(-1))
+    inliers, settled = confirm(problem, near, search.start)
+    cleaned = problem.using(inliers.mask)
+    again = _with_residual(problem, solve(cleaned, search, solver))
+    return settled, cleaned, replace(again, misfit=_misfit(again, inliers))
 
 
 def _search(problem: Problem, search: Search, solver: Solver) -> tuple[Problem, Solution]:
@@ -159,19 +154,20 @@ def _search(problem: Problem, search: Search, solver: Solver) -> tuple[Problem, 
     # From where the lens was looked for, or where the inliers were found, whichever is better.
     starts = (search.start, inliers.center)
     tries = [solve(cleaned, replace(search, start=start), solver) for start in starts]
-    again = tries[0].where(~(tries[1].known.rms < tries[0].known.rms), tries[1])
+    # Where both found the same, what is left of their steps must not choose.
+    better = tries[1].known.rms < _BETTER * tries[0].known.rms
+    again = tries[1].where(better, tries[0])
     again = replace(
         again,
         outlying=inliers.doubtful,
-        misfit=again.known.rms > MISFIT_LIMIT * inliers.rms,
+        misfit=_misfit(again, inliers),
     )
     return cleaned, _with_residual(problem, again)
 
 
-def _suspicious(problem: Problem, solution: Solution) -> Tensor:
-    """(B,) bool; see `suspicious`."""
-    freedom = problem.count - 2 * problem.line_count - solution.free.sum(-1)
-    return suspicious(problem, solution.residual, freedom)
+def _misfit(solution: Solution, inliers: Inliers) -> Tensor:
+    """(B,) bool: the powers asked for leave much more than those that follow any lens."""
+    return solution.known.rms > MISFIT_LIMIT * inliers.rms
 
 
 def _with_residual(problem: Problem, solution: Solution) -> Solution:

@@ -13,28 +13,31 @@ _FAR = 1e6  # px: powers of what is farther off overflow sooner or later
 def _normalise(weight, fewest):
     """Weights (L, P) of an item to mean 1 over its points; lines of fewer points than a line needs
     lose theirs."""
-    count, uneven = 0, 0
+    count, uneven, first = 0, 0, 0.0
     for line in range(weight.shape[0]):
         n = 0
         for p in range(weight.shape[1]):
             n += weight[line, p] > 0
-        if n < fewest:
-            for p in range(weight.shape[1]):
+        for p in range(weight.shape[1]):
+            if n < fewest:
                 weight[line, p] = 0.0
-        else:
-            count += n
-            for p in range(weight.shape[1]):
-                uneven += weight[line, p] > 0 and weight[line, p] != 1
-    if uneven == 0:
-        return
+            elif weight[line, p] > 0:
+                first = weight[line, p] if first == 0 else first
+                uneven += weight[line, p] != first
+        count += n if n >= fewest else 0
     total = 0.0
+    if uneven > 0:
+        for line in range(weight.shape[0]):
+            of_line = 0.0
+            for p in range(weight.shape[1]):
+                of_line += weight[line, p]
+            total += of_line
     for line in range(weight.shape[0]):
         for p in range(weight.shape[1]):
-            total += weight[line, p]
-    factor = count / total
-    for line in range(weight.shape[0]):
-        for p in range(weight.shape[1]):
-            weight[line, p] *= factor
+            if uneven > 0:
+                weight[line, p] *= count / total
+            elif weight[line, p] > 0:
+                weight[line, p] = 1.0
 
 
 @kernel
