@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
 from importlib.util import find_spec
 from typing import TypeVar
@@ -81,8 +81,10 @@ def run(kernel: Callable[..., None], count: int, *arguments: object) -> None:
     step = -(-count // (_SLICES * threads))
     slices = [(begin, min(begin + step, count)) for begin in range(0, count, step)]
     pool = _pool(threads, os.getpid())
-    for done in [pool.submit(kernel, *one, *arguments) for one in slices]:
-        done.result()
+    begun = [pool.submit(kernel, *one, *arguments) for one in slices]
+    wait(begun)  # whatever happens: the arrays that kernels write into must outlive them
+    for one in begun:
+        one.result()
 
 
 def side_by_side(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
@@ -101,10 +103,13 @@ def side_by_side(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
         with torch.set_grad_enabled(gradients):
             return function(part)
 
+    begun = [_pool(threads, os.getpid()).submit(alone, part) for part in parts]
     try:
-        begun = [_pool(threads, os.getpid()).submit(alone, part) for part in parts]
         return [one.result() for one in begun]
     finally:
+        for one in begun:
+            one.cancel()
+        wait(begun)
         torch.set_num_threads(all_threads)
 
 

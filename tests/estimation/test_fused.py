@@ -17,7 +17,7 @@ from torchptz.estimation.arcs import neighbour_noise
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, linearise, refine, settle_lines
 from torchptz.estimation.residuals import State, straightness
-from torchptz.estimation.robust import spread, suspicious
+from torchptz.estimation.scatter import spread, suspicious
 from torchptz.patterns import LinePatterns
 
 SCRIPTS = str(Path(__file__).resolve().parents[2] / "scripts")

@@ -11,7 +11,8 @@ from torchptz.estimation import Status, estimate
 from torchptz.estimation.maximum_likelihood import maximise
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.residuals import State, straightness
-from torchptz.estimation.robust import CUT, bad_lines, find_inliers, suspicious
+from torchptz.estimation.robust import find_inliers
+from torchptz.estimation.scatter import CUT, bad_lines, suspicious
 from torchptz.patterns import LinePatterns
 
 POWERS = synthetic.double(1.0, 2.0, 3.0)

@@ -9,7 +9,8 @@ from torchptz.compiled import arrays, run
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import RULES, Linearised, Prior, Refined
 from torchptz.estimation.residuals import State
-from torchptz.kernels import noise, refinement, weights
+from torchptz.kernels import linearise as linearisation
+from torchptz.kernels import noise, refinement, rows, weights
 from torchptz.kernels import straightness as kernels
 
 
@@ -31,7 +32,7 @@ def straightness(problem: Problem, state: State) -> Tensor:
 def linearise(problem: Problem, state: State) -> Linearised:
     """`refinement.linearise` by a kernel."""
     linear = _blank(problem)
-    run(kernels.linearise, len(problem), _data(problem), _unknowns(state), _linear(linear))
+    run(linearisation.linearise, len(problem), _data(problem), _unknowns(state), _linear(linear))
     return linear
 
 
@@ -75,7 +76,7 @@ def neighbour_noise(problem: Problem, points: Tensor) -> Tensor:
 
 
 def spread(problem: Problem, residual: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`robust.spread` by a kernel."""
+    """`scatter.spread` by a kernel."""
     median, largest = torch.empty_like(problem.scale), torch.empty_like(problem.scale)
     squares = problem.scale.new_empty(problem.weight.shape[:2])
     run(
@@ -94,7 +95,7 @@ def line_sigma(
     finest: Tensor,
     rules: tuple[float, int, int, float],
 ) -> Tensor:
-    """`robust.line_sigma` by a kernel."""
+    """`scatter.line_sigma` by a kernel."""
     sigma = problem.scale.new_empty(problem.weight.shape[:2])
     given = arrays(problem.weight, residual, used, freedom, finest)
     run(noise.line_sigma, len(problem), *given, rules, sigma.numpy())
@@ -122,7 +123,7 @@ def prepare(
     return usable, weight, bool(clean.all())
 
 
-def _data(problem: Problem) -> kernels.Data:
+def _data(problem: Problem) -> rows.Data:
     offsets, gains = problem.offsets, problem.unknowns - 2 - len(problem.powers)
     if offsets is None:
         offsets = problem.points.new_empty(0, 0, 0, 2)
@@ -130,11 +131,11 @@ def _data(problem: Problem) -> kernels.Data:
         *(problem.points, problem.mask, problem.weight, offsets, problem.powers),
         *(problem.middle, problem.scale, problem.pixel_aspect),
     )
-    return kernels.Data(points, mask, weight, offsets, gains, powers, middle, scale, aspect)
+    return rows.Data(points, mask, weight, offsets, gains, powers, middle, scale, aspect)
 
 
-def _unknowns(state: State) -> kernels.Unknowns:
-    return kernels.Unknowns(*arrays(state.theta, state.angle, state.offset))
+def _unknowns(state: State) -> rows.Unknowns:
+    return rows.Unknowns(*arrays(state.theta, state.angle, state.offset))
 
 
 def _blank(problem: Problem) -> Linearised:
@@ -152,5 +153,7 @@ def _blank(problem: Problem) -> Linearised:
     )
 
 
-def _linear(linear: Linearised) -> kernels.Linear:
-    return kernels.Linear(*(getattr(linear, name).numpy() for name in kernels.Linear._fields))
+def _linear(linear: Linearised) -> linearisation.Linear:
+    return linearisation.Linear(
+        *(getattr(linear, name).numpy() for name in linearisation.Linear._fields)
+    )

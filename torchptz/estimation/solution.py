@@ -12,7 +12,8 @@ from torchptz.batch import Batched
 from torchptz.estimation.problem import Problem
 from torchptz.estimation.refinement import Prior, Refined
 from torchptz.estimation.residuals import straightness
-from torchptz.estimation.robust import Inliers, confirm, find_inliers, suspicious, within_cut
+from torchptz.estimation.robust import Inliers, confirm, find_inliers
+from torchptz.estimation.scatter import suspicious, within_cut
 from torchptz.estimation.status import MISFIT_LIMIT, center_unobservable
 from torchptz.estimation.uncertainty import Uncertainty, from_residuals
 

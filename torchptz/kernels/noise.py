@@ -158,7 +158,7 @@ def _median(values, count):
 
 @kernel
 def line_sigma(begin, end, weight, residual, used, freedom, finest, rules, sigma):
-    """`robust.line_sigma` of items ``begin`` to ``end``.
+    """`scatter.line_sigma` of items ``begin`` to ``end``.
 
     Args:
         weight: (B, L, P).
@@ -166,7 +166,7 @@ def line_sigma(begin, end, weight, residual, used, freedom, finest, rules, sigma
         used: (B, L, P) bool.
         freedom: (B,) degrees of freedom.
         finest: (B,) px.
-        rules: the constants of `robust`: of |x| for a unit normal x the median, points that tell of
+        rules: the constants of `scatter`: of |x| for a unit normal x the median, points that tell of
             a line, lines that tell of how lines differ, standard deviations.
         sigma: (B, L) px, to be filled.
     """

@@ -12,13 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from torchptz.kernels.decorators import compiled, kernel
-from torchptz.kernels.straightness import (
-    Linear,
-    Unknowns,
-    gather,
-    linearise_item,
-    room,
-)
+from torchptz.kernels.linearise import Linear, linearise_item
+from torchptz.kernels.rows import Unknowns, gather, room
 
 
 class Given(NamedTuple):
