@@ -72,6 +72,12 @@ class TestItems:
         assert listed[1:].said == ["y", "z"]
         assert listed[-1].said == ["z"]
 
+    @pytest.mark.parametrize("index", [[], [1], [2, 0], [1, 1, 2, 1], [-1, 0]])
+    def test_lists_are_taken_along_by_indices(self, index):
+        items = Listed(torch.arange(3), ["x", "y", "z"])[torch.tensor(index, dtype=torch.long)]
+        assert items.said == ["xyz"[i] for i in index]
+        assert items.value.tolist() == [range(3)[i] for i in index]
+
     @pytest.mark.parametrize("index", [4, -5])
     def test_beyond_the_end_there_is_none(self, index):
         with pytest.raises(IndexError, match="of a batch of 4"):

@@ -120,6 +120,36 @@ class TestRoundTrips:
         assert path.read_bytes() == before
         assert list(tmp_path.iterdir()) == [path]
 
+    def test_trimmed_are_the_first_lines_and_places_of_all_there_is(self):
+        whole = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
+        cut = whole.trimmed(1, 4)
+        for name in ("points", "mask", "offsets", "sigma", "systematic"):
+            assert torch.equal(getattr(cut, name), getattr(whole, name)[:, :1, :4]), name
+        assert cut.mask.sum((1, 2)).tolist() == [3, 4]
+        assert torch.equal(cut.image_size, whole.image_size)
+        assert whole.points.shape == (2, 2, 5, 2)
+
+    def test_trimmed_to_its_size_or_beyond_a_batch_is_the_same(self):
+        whole = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
+        self.assert_same(whole.trimmed(2, 5), whole)
+        self.assert_same(whole.trimmed(9, 9), whole)
+
+    def test_trimmed_of_points_alone_are_points_alone(self):
+        cut = LinePatterns.from_lists(LISTED[0], SIZE).trimmed(2, 3)
+        assert cut.points.shape == (2, 2, 3, 2)
+        assert cut.offsets is cut.sigma is cut.systematic is None
+
+    @given(shape=shapes, seed=st.integers(0, 99), more=st.tuples(*[st.integers(0, 3)] * 2))
+    @settings(max_examples=25, deadline=None)
+    def test_trimmed_of_what_was_padded_is_what_it_was(self, shape, seed, more):
+        points, *beside = ragged(seed, shape)
+        patterns = LinePatterns.from_lists(points, SIZE, *beside)
+        _, lines, places = patterns.mask.shape
+        filler = [[np.full((places + more[1], 2), 1.0)] * (lines + more[0])]
+        padded = LinePatterns.stack([patterns, LinePatterns.from_lists(filler, SIZE)])
+        assert padded.mask.shape[1:] == (lines + more[0], places + more[1])
+        self.assert_same(padded[:-1].trimmed(lines, places), patterns)
+
     def test_without_offsets_all_else_stays(self):
         whole = LinePatterns.from_lists(LISTED[0], SIZE, *LISTED[1:])
         bare = whole.without_offsets()

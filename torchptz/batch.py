@@ -30,7 +30,7 @@ class Batched:
     def __getitem__(self, index: int | slice | Tensor) -> Self:
         """Items of the batch, as a batch: ``batch[i]`` is ``batch[i:i+1]``.
 
-        A one-dimensional tensor of indices takes those items.
+        A one-dimensional tensor of indices takes those items, one of bool those where it is True.
         """
         if not isinstance(index, slice | Tensor):
             index = operator.index(index)
@@ -38,6 +38,9 @@ class Batched:
                 raise IndexError(f"item {index} of a batch of {len(self)}")
             index %= len(self)
             index = slice(index, index + 1)
+
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]
 
         def taken(value: Tensor | Batched | list) -> Tensor | Batched | list:
             if isinstance(value, list) and isinstance(index, Tensor):

@@ -18,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 Part, Result = TypeVar("Part"), TypeVar("Result")
 
@@ -25,7 +26,7 @@ BACKENDS = ("auto", "torch", "numba")
 # A line whose points are in one place has no direction: what is left of the column of its turn when
 # that of its shift is taken out is rounding, this part of it at most (squared).
 ONE_PLACE = 1e-16
-LONGEST_LINE = 1056  # points of a line that kernels have room for
+LONGEST_LINE = 1056  # points of a line that the estimate's kernels have room for
 _SLICES = 8  # of a batch per thread: items differ in how long they take
 
 
@@ -52,7 +53,9 @@ def _numba() -> bool:
 
 def in_reach_of_kernels(*tensors: Tensor) -> bool:
     """Whether kernels can take these: on a CPU, in float64, with memory of their own, which what
-    passes through a transform of `torch.func` has not."""
+    passes through a transform of `torch.func` has not; and no tangents are carried along."""
+    if forward_ad._current_level >= 0:
+        return False
     try:
         for tensor in tensors:
             tensor.untyped_storage()
@@ -90,7 +93,7 @@ def run(kernel: Callable[..., None], count: int, *arguments: object) -> None:
 def side_by_side(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
     """``function`` of every part, in their order, on as many threads as torch has.
 
-    Torch itself works on one thread meanwhile. Its own threads wait for each other after every
+    Torch itself has one thread in each of these. Its own threads wait for each other after every
     operation, awake: as soon as a machine has anything else to do, that takes longer than the work.
     """
     threads = min(torch.get_num_threads(), len(parts))
@@ -116,4 +119,4 @@ def side_by_side(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
 @cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     """Threads of this process: a fork has none of its parent's."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="torchptz")
+    return ThreadPoolExecutor(threads, thread_name_prefix="torchptz-kernels")

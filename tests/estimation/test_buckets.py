@@ -205,7 +205,7 @@ OPTIONS = {
     "plain": {},
     "not robust": {"robust": False},
     "powers for each": {"powers": "auto"},
-    "lanz": {"method": "lanz", "max_iterations": 60},
+    "lanz": {"method": "lanz", "max_iterations": 20},
     "centre": {"center": centers},
     "prior": {"center": centers, "center_covariance": priors},
     "aspect": {"pixel_aspect": lambda count: torch.linspace(0.97, 1.03, count)},
@@ -262,13 +262,14 @@ class TestEstimate:
         shares = []
 
         def told(function, parts):
-            shares.append([part.rows.tolist() for part in parts])
+            shares.extend(part.rows for part in parts)
             return side_by_side(function, parts)
 
         monkeypatch.setattr(module, "side_by_side", told)
         threads(2)
         alike(estimate(made), whole)
-        assert shares == [[[0, 1, 2, 3], [4, 5, 6, 7], [8]]]
+        assert len(shares) >= 2
+        assert torch.cat(shares).tolist() == [*range(9)]
 
     def test_tells_each_items_own_status(self, patterns):
         status = estimate(patterns).status

@@ -156,14 +156,18 @@ class TestInterrupt:
         finally:
             signal.signal(signal.SIGINT, before)
         assert 2 <= len(finished) == begun.taken < 500
-        assert not [one for one in threading.enumerate() if one.name.startswith("torchptz")]
+        assert not [
+            one for one in threading.enumerate() if one.name.startswith("torchptz-pictures")
+        ]
 
     def test_a_stream_that_is_left_ends_its_threads(self):
         results = in_order(str, count(), workers=2)
         next(results)
-        assert [one for one in threading.enumerate() if one.name.startswith("torchptz")]
+        assert [one for one in threading.enumerate() if one.name.startswith("torchptz-pictures")]
         results.close()
-        assert not [one for one in threading.enumerate() if one.name.startswith("torchptz")]
+        assert not [
+            one for one in threading.enumerate() if one.name.startswith("torchptz-pictures")
+        ]
 
 
 @pytest.fixture

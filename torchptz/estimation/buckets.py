@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchptz.compiled import LONGEST_LINE
+
 # An item shares a bucket with others at most so many times its size, in lines and in points each:
 # with sizes spread evenly, half of what this allows is padding.
 _ALIKE = 1.2
@@ -74,7 +76,9 @@ def _by_size(size: Tensor) -> list[Tensor]:
                 top, number = value, number + 1
             label.append(number)
         found.append(torch.tensor(label[::-1], device=size.device)[index])
-    label = found[0] * (int(found[1].max()) + 1) + found[1]
+    # Lines that are too long for kernels do not take others with them.
+    found.append((size[:, 1] > LONGEST_LINE).long())
+    label = (found[0] * (int(found[1].max()) + 1) + found[1]) * 2 + found[2]
     order = label.argsort(stable=True)
     counts = label.unique(return_counts=True)[1].tolist()
     return list(order.split(counts))

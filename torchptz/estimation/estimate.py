@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchptz.batch import Batched
-from torchptz.compiled import chosen, side_by_side
+from torchptz.compiled import LONGEST_LINE, chosen, side_by_side
 from torchptz.estimation.buckets import Bucket, buckets
 from torchptz.estimation.fixed_point import iterate
 from torchptz.estimation.implicit import differentiable
@@ -183,7 +183,12 @@ def estimate(
     if threads > 1 and size >= threads * _LEAST:
         most = min(most, -(-size // threads))
     parts = buckets(patterns.mask, most)
-    if len(parts) == 1:
+    if backend == "numba" and max(part.places for part in parts) > LONGEST_LINE:
+        raise ValueError(
+            f"backend 'numba' has room for {LONGEST_LINE} points a line: use 'auto', which takes "
+            "torch for items with longer ones"
+        )
+    if len(parts) == 1 and parts[0][1:] == shape:
         return fit(patterns, aspect, search)
 
     def fit_part(part: Bucket) -> Fit:

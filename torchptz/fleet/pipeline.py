@@ -68,7 +68,7 @@ def _in_order(
     ended: Exception | None = None
     with one_thread_a_call():
         pool = ThreadPoolExecutor(
-            workers, "torchptz", initializer=torch.set_num_threads, initargs=(1,)
+            workers, "torchptz-pictures", initializer=torch.set_num_threads, initargs=(1,)
         )
         try:
             while True:

@@ -37,8 +37,9 @@ def _kept(function: Callable, options: dict) -> Callable:
         dispatcher = njit(cache=True, **options)(function)
     except RuntimeError:  # no place to keep it
         return njit(**options)(function)
-    stored = dispatcher._cache._cache_file
-    stored._source_stamp = (stored._source_stamp, _digest())
+    stored = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if stored is not None:  # numba may be told not to compile at all
+        stored._source_stamp = (stored._source_stamp, _digest())
     return dispatcher
 
 

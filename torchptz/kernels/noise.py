@@ -166,8 +166,8 @@ def line_sigma(begin, end, weight, residual, used, freedom, finest, rules, sigma
         used: (B, L, P) bool.
         freedom: (B,) degrees of freedom.
         finest: (B,) px.
-        rules: the constants of `scatter`: of |x| for a unit normal x the median, points that tell of
-            a line, lines that tell of how lines differ, standard deviations.
+        rules: the constants of `scatter`: the median of |x| for a unit normal x, how many points
+            tell of a line, how many lines of how lines differ, standard deviations.
         sigma: (B, L) px, to be filled.
     """
     normal_median, telling_points, telling_lines, most_excess = rules

@@ -82,16 +82,17 @@ class BoundedCache(Generic[Value]):
         compute: Callable[[list[int]], Sequence[Value]],
     ) -> None:
         try:
-            values = compute(missing)
+            values = list(zip(missing, compute(missing), strict=True))
+            sizes = [self._size_of(value) for _, value in values]
         except BaseException:
             with self._lock:
                 for position in missing:
                     self._pending.pop(keys[position]).cancel()
             raise
         with self._lock:
-            for position, value in zip(missing, values, strict=True):
+            for (position, value), size in zip(values, sizes, strict=True):
                 self._kept[keys[position]] = value
-                self._bytes += self._size_of(value)
+                self._bytes += size
                 self._pending.pop(keys[position]).set_result(value)
             while self._bytes > self.limit:
                 _, oldest = self._kept.popitem(last=False)
