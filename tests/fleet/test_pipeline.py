@@ -144,6 +144,7 @@ class TestInterrupt:
 
         def slow(i):
             if begun.enter() == 2:  # both workers are inside
+                time.sleep(0.3)  # and the main thread has done handing work out
                 signal.pthread_kill(main, signal.SIGINT)
             go_on.wait(60)
             time.sleep(0.02)

@@ -1,4 +1,9 @@
-"""Compiled looks at points and residuals that need an order: medians, and neighbours on a line."""
+"""Compiled looks at points and residuals that need an order: medians, and neighbours on a line.
+
+A median keeps, pivot by pivot, the values on its rank's side, by loops without branches, where a
+sort of the batch orders everything; lines that are in order already are seen to be so and not
+sorted. Some ten operations a point, bound by reading it.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 Each item goes through all of its own steps before the next begins, in a few tens of kilobytes that
 stay in the core's cache; none waits for another, and nothing is computed for those that are done.
+Bound by the arithmetic of `linearise`, of which an item needs about six.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""Compiled weights: which points of a batch are used, and how much each counts."""
+"""Compiled weights: which points of a batch are used, and how much each counts.
+
+One pass over the points instead of one for every condition: bound by memory, 16 bytes a point in
+and 9 out.
+"""
 
 from __future__ import annotations
 
