@@ -13,12 +13,17 @@ SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_thread():
-    """Tensors of test size gain nothing from threads and wait for each other on a busy machine."""
+def _threads_restored():
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """Tensors of test size gain nothing from threads and wait for each other on a busy machine. A
+    test begins with one, whatever the one before it left."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")
