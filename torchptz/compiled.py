@@ -59,7 +59,7 @@ def in_reach_of_kernels(*tensors: Tensor) -> bool:
     try:
         for tensor in tensors:
             tensor.untyped_storage()
-    except NotImplementedError:
+    except RuntimeError:
         return False
     return all(t.dtype == torch.float64 and chosen("auto", t.device) for t in tensors)
 

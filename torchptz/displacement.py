@@ -63,16 +63,17 @@ def reference_sigma(
 def _by_kernel(lens: RadialLens, points: Tensor, covariance: Tensor, part: Part) -> Tensor:
     """`reference_sigma` by a kernel, but for lenses whose homographies are not determined."""
     from torchptz.kernels import displacement as kernels
+    from torchptz.kernels.homographies import GRID_ROOM, Lenses
 
     lens.check_points(points)
     shape = (len(lens), *points.shape[1:-1])
     flat = points.reshape(len(points), math.prod(shape[1:]), 2)
-    share = torch.full((2, kernels.GRID_ROOM), math.nan, dtype=torch.float64)
+    share = torch.full((2, GRID_ROOM), math.nan, dtype=torch.float64)
     places = _grid_shares()
     share[:, : len(places)] = places.T
     sigma = torch.empty(len(lens), flat.shape[1], dtype=torch.float64)
     known = torch.empty(len(lens), dtype=torch.bool)
-    lenses = kernels.Lenses(
+    lenses = Lenses(
         *arrays(
             *(lens.center, lens.coefficients, lens.powers, lens.scale, lens.pixel_aspect),
             *(lens.image_size, lens.fold),
