@@ -37,6 +37,7 @@ SECTIONS = {
     "head": ("imperfections", "views"),
     "estimate": ("patterns", "scaling", "ragged", "loop", "resident", "complete"),
     "rectify": ("frames", "tensors", "maps", "folder"),
+    "faults": ("runs",),
 }
 _ROOT = Path(__file__).resolve().parents[1]
 _FILE = click.Path(dir_okay=False, path_type=Path)
@@ -146,6 +147,13 @@ def estimate(**options: object) -> None:
 def rectify(**options: object) -> None:
     """Measure how fast pictures are rectified, beside other programs."""
     _measure("rectify", **options)
+
+
+@main.command()
+@_options("faults")
+def faults(**options: object) -> None:
+    """Calibrate cameras with which something is wrong: a true table, or refused, and why."""
+    _measure("faults", **options)
 
 
 @main.command()

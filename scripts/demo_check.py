@@ -293,12 +293,15 @@ def undistortion(lens: RadialLens) -> Callable[[np.ndarray], np.ndarray]:
 
 def _head(camera: str, head: HeadResult, truth: CameraTruth) -> list[HeadFigure]:
     tilt_zero, boresight, roll = truth.head_angles_deg()
+    if head.backlash_deg is None:
+        # Approached upwards the load always stays behind the motor, by half of the play.
+        tilt_zero -= truth.head["backlash_deg"][1] / 2
     figures = [
         HeadFigure(camera, "tilt zero", head.tilt_zero_deg, head.tilt_zero_sigma_deg, tilt_zero),
         HeadFigure(camera, "boresight", head.boresight_deg, head.boresight_sigma_deg, boresight),
         HeadFigure(camera, "roll", head.roll_deg, head.roll_sigma_deg, roll),
     ]
-    for axis, name in enumerate(("pan", "tilt")):
+    for axis, name in enumerate(("pan", "tilt")) if head.backlash_deg else ():
         play = truth.head["backlash_deg"][axis]
         found, sigma = head.backlash_deg[axis], head.backlash_sigma_deg[axis]
         figures.append(HeadFigure(camera, f"{name} backlash", found, sigma, play))

@@ -46,6 +46,7 @@ def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.nd
         )
         undo.callback(camera.close)
         undo.callback(camera.restore)
+        camera.connect()
         camera.prepare()
         can, timing = camera.capabilities, config.timing
         pose = can.nearest_reachable(math.radians(board.pan_deg), math.radians(board.tilt_deg))

@@ -47,6 +47,28 @@ class FakeCamera:
     # (3, 3) rotation of the camera in the head's moving frame
     mount: Tensor = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
     tilt_zero: float = 0.0  # rad, true tilt less the reading
+    identity: str = "in memory"
+    notes: list[str] = field(default_factory=list)
+    axes: None = None  # nobody asks for them but the probe
+    zoom_curve: None = None
+
+    def connect(self) -> None:
+        """There is nobody to ask."""
+
+    def at_rest(self) -> None:
+        """It does not tell."""
+
+    def focus_once(self) -> float:
+        return 1.0
+
+    def set_focus(self, focus: float) -> None:
+        assert focus == 1.0
+
+    def learn(self, **_) -> None:
+        """It knows itself."""
+
+    def restrict(self, **_) -> None:
+        """It has no stops."""
 
     def move(self, pose: Pose) -> None:
         self.pose = Pose(*self.capabilities.nearest_reachable(pose.pan, pose.tilt), pose.zoom)
@@ -111,6 +133,7 @@ class FakeObserver:
         near=None,
         search_radius=math.inf,
         expected_radius=None,
+        direct=False,
     ) -> Observation:
         number = len(self.looks)
         self.camera.move(pose)

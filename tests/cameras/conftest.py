@@ -1,12 +1,16 @@
 """Fake cameras on loopback, written against the wire protocol and not against the drivers."""
 
 import base64
+import hashlib
+import itertools
 import re
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
+from urllib.request import parse_http_list, parse_keqv_list
 
 import cv2
 import numpy as np
@@ -29,14 +33,35 @@ def http_reply(
     return eol.join(line.encode() for line in lines) + eol + last_eol + body
 
 
-class FakeDevice:
-    """Answers each GET with the bytes that ``answer(request)`` returns, and keeps the requests.
+class _Listener(ThreadingHTTPServer):
+    tls: ssl.SSLContext | None = None
 
-    A request has .path, .query (dict, lower-case names) and .headers. An iterator instead of
-    bytes is sent piece by piece.
+    def get_request(self):
+        connection, client = super().get_request()
+        if (
+            self.tls is not None
+        ):  # the handshake comes with the first read, in the thread of its own
+            connection = self.tls.wrap_socket(
+                connection, server_side=True, do_handshake_on_connect=False
+            )
+        return connection, client
+
+    def handle_error(self, request, client_address) -> None:
+        pass  # a client that hangs up, amid a handshake too, is what is being tested
+
+
+class FakeDevice:
+    """Answers each request with the bytes that ``answer(request)`` returns, and keeps the requests.
+
+    A request has .method, .path, .query (dict, lower-case names), .headers and .body. An iterator
+    instead of bytes is sent piece by piece. With a TLS context it speaks HTTPS.
     """
 
-    def __init__(self, answer: Callable[[SimpleNamespace], bytes | Iterator[bytes]]) -> None:
+    def __init__(
+        self,
+        answer: Callable[[SimpleNamespace], bytes | Iterator[bytes]],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
         device = self
         self.requests: list[SimpleNamespace] = []
         self.together = self.most_together = 0
@@ -47,7 +72,13 @@ class FakeDevice:
                 url = urlsplit(self.path)
                 query = {name.lower(): values[0] for name, values in parse_qs(url.query).items()}
                 request = SimpleNamespace(
-                    target=self.path, path=url.path, query=query, headers=self.headers
+                    method=self.command,
+                    target=self.path,
+                    path=url.path,
+                    query=query,
+                    headers=self.headers,
+                    body=self.rfile.read(int(self.headers.get("Content-Length", 0))),
+                    challenged=False,
                 )
                 with lock:
                     device.requests.append(request)
@@ -55,6 +86,8 @@ class FakeDevice:
                     device.most_together = max(device.most_together, device.together)
                 try:
                     reply = answer(request)
+                    if isinstance(reply, bytes):
+                        request.challenged = reply.startswith(b"HTTP/1.0 401")
                     for piece in [reply] if isinstance(reply, bytes) else reply:
                         self.wfile.write(piece)
                         self.wfile.flush()
@@ -65,10 +98,13 @@ class FakeDevice:
                         device.together -= 1
                 self.close_connection = True
 
+            do_POST = do_PUT = do_GET
+
             def log_message(self, *args) -> None:
                 pass
 
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server = _Listener(("127.0.0.1", 0), Handler)
+        self._server.tls = tls
         self._server.daemon_threads = True
         self._server.block_on_close = False
         self.address = f"127.0.0.1:{self._server.server_address[1]}"
@@ -76,11 +112,88 @@ class FakeDevice:
 
     @property
     def targets(self) -> list[str]:
-        return [request.target for request in self.requests]
+        """Of the requests that passed the login."""
+        return [request.target for request in self.requests if not request.challenged]
 
     def stop(self) -> None:
         self._server.shutdown()
         self._server.server_close()
+
+
+class DigestGate:
+    """A login of RFC 7616, checked without the code under test; lets ``answer`` reply behind it.
+
+    one_shot: each nonce opens once. basic: offer Basic too, "before" or "after" Digest.
+    """
+
+    def __init__(self, user: str, password: str, answer=lambda _: http_reply(200, b"in")) -> None:
+        self.user, self.password, self.answer = user, password, answer
+        self.algorithm: str | None = "MD5"
+        self.qop: str | None = "auth"
+        self.one_shot, self.basic, self.one_header = False, "", False
+        self.accepted = self.refused = self.spent = 0
+        self._nonces: dict[str, int] = {}  # the greatest count of uses that each was sent with
+        self._names = itertools.count()
+
+    def __call__(self, request: SimpleNamespace) -> bytes:
+        authorization = request.headers.get("Authorization")
+        stale = False
+        if authorization is not None:
+            fields = parse_keqv_list(parse_http_list(authorization.removeprefix("Digest ")))
+            used = self._nonces.get(fields.get("nonce"))
+            stale = used is None or (self.one_shot and used > 0)
+            if not stale and self._fits(request, fields):
+                self._nonces[fields["nonce"]] = int(fields.get("nc", "1"), 16)
+                self.accepted += 1
+                return self.answer(request)
+            self.spent += stale
+            self.refused += not stale
+        return http_reply(401, headers=self._challenges(stale))
+
+    def forget(self) -> None:
+        """Drop all nonces, as after a restart."""
+        self._nonces.clear()
+
+    def _challenges(self, stale: bool) -> tuple[str, ...]:
+        nonce = f"n{next(self._names)},/+=="
+        self._nonces[nonce] = 0
+        fields = {"realm": 'Sony \\"Cam\\", 2', "nonce": nonce, "opaque": "o7", "qop": self.qop}
+        digest = "Digest " + ", ".join(f'{k}="{v}"' for k, v in fields.items() if v is not None)
+        if self.algorithm:
+            digest += f", algorithm={self.algorithm}"
+        digest += ", stale=true" if stale else ""
+        both = [digest]
+        if self.basic:
+            both.insert(0 if self.basic == "before" else 1, 'Basic realm="x"')
+        if self.one_header:
+            both = [", ".join(both)]
+        return tuple(f"WWW-Authenticate: {one}" for one in both)
+
+    def _fits(self, request: SimpleNamespace, fields: dict[str, str]) -> bool:
+        def digest(*parts: str | bytes) -> str:
+            new = hashlib.sha256 if "256" in (self.algorithm or "") else hashlib.md5
+            return new(
+                b":".join(p if isinstance(p, bytes) else p.encode() for p in parts)
+            ).hexdigest()
+
+        ours = digest(self.user, 'Sony "Cam", 2', self.password)
+        if (self.algorithm or "").endswith("-sess"):
+            ours = digest(ours, fields["nonce"], fields["cnonce"])
+        asked = [request.method, request.target]
+        if fields.get("qop") == "auth-int":
+            asked.append(digest(request.body))
+        parts = [fields["nonce"]]
+        if self.qop is not None:
+            assert fields["qop"] in self.qop.replace(" ", "").split(",")
+            if int(fields["nc"], 16) <= self._nonces[fields["nonce"]]:
+                return False  # a replay
+            parts += [fields["nc"], fields["cnonce"], fields["qop"]]
+        wanted = digest(ours, *parts, digest(*asked))
+        return (
+            fields["response"] == wanted
+            and fields["uri"] == request.target
+            and fields["opaque"] == "o7"
+        )
 
 
 class FakeRZ30:
@@ -186,12 +299,18 @@ def jpeg():
 
 
 @pytest.fixture
+def digest_gate():
+    """Makes Digest logins: digest_gate(user, password, answer=...) -> DigestGate."""
+    return DigestGate
+
+
+@pytest.fixture
 def device():
-    """Starts fake devices: device(answer) -> FakeDevice; stops them afterwards."""
+    """Starts fake devices: device(answer, tls=None) -> FakeDevice; stops them afterwards."""
     started = []
 
-    def start(answer) -> FakeDevice:
-        started.append(FakeDevice(answer))
+    def start(answer, tls: ssl.SSLContext | None = None) -> FakeDevice:
+        started.append(FakeDevice(answer, tls))
         return started[-1]
 
     yield start

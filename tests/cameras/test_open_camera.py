@@ -1,6 +1,7 @@
 import pytest
 
-from torchptz.cameras import DIALECTS, Camera, open_camera
+from torchptz.cameras import DIALECTS, open_camera
+from torchptz.cameras.driver import Driver
 
 
 class TestOpenCamera:
@@ -8,7 +9,7 @@ class TestOpenCamera:
     def test_every_dialect_opens_without_traffic(self, dialect, device, http_reply):
         fake = device(lambda _: http_reply())
         camera = open_camera(dialect, "gate", fake.address, None)
-        assert isinstance(camera, Camera)
+        assert isinstance(camera, Driver)
         assert camera.name == "gate"
         assert fake.requests == []
 

@@ -15,6 +15,7 @@ from tests.fake_camera import FakeCamera, FakeObserver, capabilities
 from torchptz.fleet import collector
 from torchptz.fleet.config import parse_config
 from torchptz.fleet.driver import collect
+from torchptz.fleet.probe_report import ProbeReport
 from torchptz.geometry import pan_rotation, ray_from_pan_tilt
 from torchptz.simulation import SimulatedFleet
 
@@ -98,6 +99,7 @@ def crooked_run(tmp_path_factory):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(collector, "open_camera", lambda dialect, name, *_, **__: cameras[name])
+        patch.setattr(collector, "probe", lambda camera, *_, **__: ProbeReport(camera.name, ""))
         patch.setattr(
             collector,
             "Observer",

@@ -14,8 +14,10 @@ import pytest
 
 from torchptz.cameras import Capabilities, ConnectionFailed, Pose
 from torchptz.fleet import collector as module
+from torchptz.fleet import survey
 from torchptz.fleet.collector import Collector
 from torchptz.fleet.journal import JOURNAL_NAME, read_journal
+from torchptz.fleet.probe_report import ProbeReport
 from torchptz.fleet.records import CameraRecord
 from torchptz.patterns import LinePatterns
 from torchptz.simulation import CameraTruth
@@ -144,7 +146,14 @@ class TestHealthy:
             else:
                 assert look.reason
         purposes = [look.purpose for look in seen]
-        assert list(dict.fromkeys(purposes)) == ["locate", "ray", "track", "line"]
+        assert list(dict.fromkeys(purposes)) == [
+            "locate",
+            "way",
+            "ray",
+            "track",
+            "reference",
+            "line",
+        ]
         assert purposes.count("ray") == 9
 
     def test_the_patterns_are_the_journal_s_pixels(self, healthy):
@@ -183,7 +192,7 @@ class TestHealthy:
         focal = [zoom.focal_length_px for zoom in healthy.record.zooms]
         for found, length in zip(largest, focal, strict=True):
             assert float(found[0]) == pytest.approx(length * healthy.record.ray_sigma, rel=0.5)
-        assert 0.5 < float(largest[0][2]) < 5
+        assert 0.2 < float(largest[0][2]) < 5
 
     def test_the_true_lens_and_the_offsets_straighten_every_line(self, healthy):
         truth = CameraTruth.of(healthy.simulated)
@@ -356,14 +365,14 @@ class TestProgress:
 
 class TestNothingSeen:
     def test_of_a_zoom_leaves_its_nominal_magnification_and_the_reason(self, one, monkeypatch):
-        scan_tracks = module.scan_tracks
+        scan_tracks = survey.scan_tracks
 
         def without_the_wanted_level(observer, levels, *args):
             tracks = scan_tracks(observer, levels, *args)
             tracks.points[:, levels.index(observer.camera.zoom_units(2.0))] = np.nan
             return tracks
 
-        monkeypatch.setattr(module, "scan_tracks", without_the_wanted_level)
+        monkeypatch.setattr(survey, "scan_tracks", without_the_wanted_level)
         monkeypatch.setattr(module, "scan_pattern", lambda *args: iter(()))
         record = one.run()
         assert record.finished
@@ -371,16 +380,17 @@ class TestNothingSeen:
         assert (zoom.patterns, zoom.lines) == (None, 0)
         assert "no line" in zoom.error
         assert zoom.nominal_zoom == 2.0
-        assert zoom.magnification == pytest.approx(2.0)
+        # the lens stands at whole units
+        assert zoom.magnification == pytest.approx(2.0, rel=2e-4)
         assert zoom.magnification_sigma is None
         truth = CameraTruth.of(one.simulated)
         assert zoom.focal_length_px == pytest.approx(truth.focal_length(zoom.zoom_units), rel=0.1)
 
 
 class FakeCamera:
-    """Only keeps the calls; those named in `broken` raise."""
+    """Only keeps the calls; those named in `broken` raise. Nothing about it is to be learnt."""
 
-    name = "gate"
+    name, identity, notes = "gate", "", ()
     capabilities = Capabilities(
         (-1, 1), (-1, 1), 0, 0, 0, 0, (0.0, 16384.0), 25.0, None, True, False
     )
@@ -392,6 +402,12 @@ class FakeCamera:
         self.calls.append((name, *args))
         if name in self.broken:
             raise self.broken[name]
+
+    def connect(self):
+        """There is nobody to ask."""
+
+    def zoom_units(self, magnification):
+        return 16384.0
 
     def position(self):
         self._call("position")
@@ -421,6 +437,7 @@ class TestPuttingBack:
     def run(self, one, monkeypatch, broken):
         camera = FakeCamera(broken)
         monkeypatch.setattr(module, "open_camera", lambda *args, **options: camera)
+        monkeypatch.setattr(module, "probe", lambda *args, **options: ProbeReport("gate", ""))
         return camera, one.run()
 
     @pytest.mark.parametrize("failing", [None, "move", "restore", "close"])
@@ -431,7 +448,8 @@ class TestPuttingBack:
         caplog.set_level(logging.WARNING)
         broken = {failing: error}
         camera, record = self.run(one, monkeypatch, broken)
-        assert tuple(camera.calls) == (("position",), ("prepare",), *self.BACK)
+        start = (("position",), ("prepare",), ("position",))
+        assert tuple(camera.calls) == (*start, *self.BACK)
         # the error that ended the collection is told, the later ones are logged
         assert "cannot be reached" in record.error
         assert ("while putting it back" in caplog.text) == (failing is not None)

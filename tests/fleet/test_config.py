@@ -3,10 +3,12 @@
 import math
 from pathlib import Path
 
+import certifi
 import pytest
 import yaml
 
 from torchptz.calibration import Priors
+from torchptz.cameras import Tls
 from torchptz.fleet.config import ConfigError, FleetConfig, load_config, parse_config
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -34,7 +36,7 @@ class TestDefaults:
         scan = one.scan
         assert (scan.horizontal, scan.vertical, scan.oblique) == (12, 10, 0)
         assert (scan.points_per_line, scan.tracks) == (20, 8)
-        assert (one.pixel_aspect, one.pan_sign, one.tilt_sign) == (1.0, 1, 1)
+        assert (one.pixel_aspect, one.pan_sign, one.tilt_sign) == (1.0, None, None)
         assert (scan.design, scan.target_sigma_px) == ("spread", 0.2)
         assert one.feature.kind == "ball"
         assert one.feature.direction() is None
@@ -129,6 +131,27 @@ class TestDirectionsAndOptions:
         assert driver.capabilities.tilt_limits == pytest.approx((-high, -low))
 
 
+class TestTls:
+    def test_a_fingerprint_is_taken_with_colons_or_without(self):
+        tls = {"fingerprint": ":".join(["AB"] * 32)}
+        one = parse_config({"cameras": [camera(tls=tls)]}).cameras[0]
+        assert one.driver_options()["tls"] == Tls(fingerprint=tls["fingerprint"])
+
+    def test_without_the_section_there_is_no_encryption(self):
+        one = parse_config({"cameras": [camera()]}).cameras[0]
+        assert one.driver_options()["tls"] is None
+
+    def test_a_camera_that_pins_drops_the_defaults_authority(self, tmp_path):
+        data = {
+            "defaults": {"tls": {"ca_file": "ca.pem"}},
+            "cameras": [camera(tls={"fingerprint": "cd" * 32}), camera("other", address="other")],
+        }
+        (tmp_path / "ca.pem").write_bytes(Path(certifi.where()).read_bytes())
+        one, other = (c.tls for c in parse_config(data, folder=tmp_path).cameras)
+        assert (one.ca_file, one.fingerprint) == (None, "cd" * 32)
+        assert other.ca_file == str(tmp_path / "ca.pem")
+
+
 class TestMessages:
     @pytest.mark.parametrize(
         ("settings", "words"),
@@ -152,6 +175,12 @@ class TestMessages:
             ({"zooms": []}, ["zooms", "at least 1"]),
             ({"pan_sign": 2}, ["pan_sign", "1 or -1", "2"]),
             ({"pan_sign": True}, ["pan_sign", "1 or -1", "True"]),
+            ({"device": {"fokus_wait_s": 2}}, ["device.fokus_wait_s", "mean focus_wait_s?"]),
+            ({"device": {"pan_speed": 99}}, ["device: pan_speed must be 1..24"]),
+            ({"tls": {"fingerprint": "12:34"}}, ["tls", "SHA-256", "64 hexadecimal"]),
+            ({"tls": {"fingerprint": "ab" * 32, "verify": False}}, ["tls", "not several"]),
+            ({"tls": {"fingerprint": "ab" * 32, "ca_file": "a"}}, ["tls", "not several"]),
+            ({"scan": {"overshoot_deg": -1}}, ["scan.overshoot_deg", ">= 0"]),
             ({"pixel_aspect": math.nan}, ["pixel_aspect", "finite", "nan"]),
             ({"dialect": "sony_rz3"}, ["dialect", "sony_rz30", "did you mean sony_rz30?"]),
             ({"address": "http://host/"}, ["address", "host:port"]),

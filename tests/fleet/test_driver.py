@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchptz.fleet import collector as collector_module
+from torchptz.fleet import survey
 from torchptz.fleet.config import parse_config
 from torchptz.fleet.driver import collect
 from torchptz.fleet.journal import JOURNAL_NAME, read_journal
@@ -65,7 +65,7 @@ def run(start_fleet, tmp_path_factory):
     }
     told, listener, root = [], Listener(), logging.getLogger()
     level = root.level
-    approach = collector_module.approach
+    approach = survey.approach
 
     def defective(observer, *args):
         if observer.camera.name == "defect":
@@ -73,7 +73,7 @@ def run(start_fleet, tmp_path_factory):
         return approach(observer, *args)
 
     with start_fleet(folder, cameras) as fleet, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collector_module, "approach", defective)
+        patch.setattr(survey, "approach", defective)
         fleet.secrets["password"] = "not-this-one"
         (folder / "password.password").write_text("not-this-one")
         root.addHandler(listener)

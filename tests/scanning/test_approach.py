@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from torchptz.cameras import Capabilities, MotionError, Pose
-from torchptz.cameras.sony_zoom import magnification_of, units_of
-from torchptz.scanning import observation
+from torchptz.cameras.sony_zoom import curve
+from torchptz.scanning import head_motion, observation
 from torchptz.scanning.approach import FeatureNotFound, approach
 from torchptz.scanning.observation import Observer
 from torchptz.simulation import CameraConfig, SimulatedCamera
@@ -61,6 +61,12 @@ class InMemoryCamera:
             reports_motion=False,
         )
 
+    def at_rest(self):
+        return None
+
+    def focus_once(self):
+        return None
+
     def move(self, pose):
         self.poses.append(pose)
         self.truth.move_to(*self.signs * (pose.pan, pose.tilt), 5.0, 5.0)
@@ -76,8 +82,8 @@ class InMemoryCamera:
             return self.frozen
         return self.truth.render(self.truth.head.true_pose(), len(self.poses))
 
-    zoom_units = staticmethod(units_of)
-    magnification = staticmethod(magnification_of)
+    zoom_units = staticmethod(curve(25.0).units_of)
+    magnification = staticmethod(curve(25.0).magnification_of)
 
 
 class Setup:
@@ -118,7 +124,8 @@ class Setup:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Time()
-    monkeypatch.setattr(observation, "time", clock)
+    for module in (observation, head_motion):
+        monkeypatch.setattr(module, "time", clock)
     return clock
 
 
@@ -221,7 +228,9 @@ class TestAxes:
             setup.camera.frozen = setup.camera.truth.render(setup.camera.truth.head.true_pose())
 
         setup.on_look = freeze
-        with pytest.raises(MotionError, match=r"camera gate: .*does not follow the pan.*frozen"):
+        with pytest.raises(
+            MotionError, match=r"camera gate: .*still shows the view from before.*frozen"
+        ):
             setup.approach(18.0, 8.0)
 
 

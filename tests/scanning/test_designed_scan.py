@@ -21,6 +21,7 @@ from torchptz.fleet import designed as designed_collection
 from torchptz.fleet.collector import Collector
 from torchptz.fleet.config import parse_config
 from torchptz.fleet.journal import JOURNAL_NAME, read_journal
+from torchptz.fleet.probe_report import ProbeReport
 from torchptz.fleet.solve import solve
 from torchptz.geometry import ray_from_pan_tilt
 from torchptz.observations import Observations
@@ -227,6 +228,7 @@ def in_memory(monkeypatch, tmp_path, camera=None, head=None, noise=0.05, zooms=Z
         }
     )
     monkeypatch.setattr(collector, "open_camera", lambda *_, **__: camera)
+    monkeypatch.setattr(collector, "probe", lambda *_, **__: ProbeReport("fake"))
     monkeypatch.setattr(
         collector,
         "Observer",

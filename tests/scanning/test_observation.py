@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from torchptz.cameras import BadPicture, Capabilities, MotionError, Pose
+from torchptz.scanning import head_motion
 from torchptz.scanning import observation as module
 from torchptz.scanning.observation import Observer, Stopped
 
@@ -51,6 +52,18 @@ class FakeCamera:
         reads_position=True,
         reports_motion=False,
     )
+
+    def at_rest(self):
+        return None
+
+    def focus_once(self):
+        return 1.0
+
+    def set_focus(self, focus):
+        assert focus == 1.0
+
+    def magnification(self, units):
+        return 25.0 ** (units / 16384)
 
     def __init__(self, clock, path=lambda start, target, t: target, reply_s=REPLY_S):
         self.clock, self.path, self.reply_s = clock, path, reply_s
@@ -127,6 +140,7 @@ def steady(speed, delay=0.0, pause=(0.0, 0.0)):
 def clock(monkeypatch):
     clock = Time()
     monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(head_motion, "time", clock)
     return clock
 
 

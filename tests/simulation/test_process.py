@@ -125,6 +125,38 @@ class TestEndsWithItsUser:
         )
 
 
+class TestAsked:
+    def test_switches_faults_while_it_runs(self):
+        with serve_in_process(CONFIG) as served:
+            served.set_faults("a", busy_every=1)
+            assert inquire(served["a"], "a").status_code == 503
+            assert inquire(served["b"], "b").status_code == 200
+            served.set_faults("a", busy_every=0)
+            assert inquire(served["a"], "a").status_code == 200
+
+    def test_counts_wrong_logins(self):
+        with serve_in_process(CONFIG) as served:
+            inquire(served["a"], "wrong")
+            assert (served.rejected_logins("a"), served.rejected_logins("b")) == (1, 0)
+
+    def test_writes_the_truth_of_now(self, tmp_path):
+        with serve_in_process(CONFIG) as served:
+            served.set_faults("a", mirrored=True)
+            served.write_truth(tmp_path / "truth.json")
+        truths = load_truth(tmp_path / "truth.json")
+        assert [truths[name].picture.mirrored for name in "ab"] == [True, False]
+
+    def test_says_what_it_cannot_do_and_lives(self):
+        with serve_in_process(CONFIG) as served:
+            with pytest.raises(SimulationError, match="no such simulated camera"):
+                served.set_faults("c", busy_every=1)
+            with pytest.raises(SimulationError, match="lens_cap"):
+                served.set_faults("a", lens_cap=True)
+            assert answers(served["a"])
+        with pytest.raises(SimulationError, match="has ended"):
+            served.set_faults("a", busy_every=1)
+
+
 class TestFailure:
     def test_says_what_the_process_said(self, tmp_path):
         with (

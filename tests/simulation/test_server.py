@@ -127,6 +127,17 @@ class TestShell:
             assert connection.recv(4096).startswith(b"HTTP/1.0 400 ")
         assert get(fleet, INQUIRY).status_code == 200
 
+    @pytest.mark.parametrize(
+        ("content_type", "taken"),
+        [(None, True), ("application/x-www-form-urlencoded", True), ("application/xml", False)],
+    )
+    def test_parameters_come_from_query_and_forms_alone(self, fleet, content_type, taken):
+        headers = {} if content_type is None else {"Content-Type": content_type}
+        url = f"http://{fleet.addresses['gate']}/command/ptzf.cgi"
+        body = b"visca=8101044701000000FF"
+        reply = requests.post(url, body, auth=LOGIN, headers=headers, timeout=5)
+        assert reply.status_code == (204 if taken else 400)
+
     def test_unknown_method_still_speaks_as_the_device(self, fleet):
         reply = requests.delete(f"http://{fleet.addresses['gate']}/", auth=LOGIN, timeout=5)
         assert reply.status_code == 501

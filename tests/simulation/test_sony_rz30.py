@@ -172,6 +172,14 @@ class TestSettings:
         lines = get(url, "/command/inquiry.cgi?inqjs=sysinfo").text.splitlines()
         assert 'var ModelName="SNC-RZ30P"' in lines
 
+    def test_overlay(self, fleet, url):
+        camera = fleet.cameras["rz30"]
+        for word, on in (("off", False), ("on", True)):
+            reply = get(url, f"/command/superimpose.cgi?SuperImpose={word}")
+            assert (reply.status_code, camera.overlay) == (204, on)
+            assert get(url, "/command/inquiry.cgi?inq=superimpose").text == f"SuperImpose={word}"
+        assert get(url, "/command/superimpose.cgi?SuperImpose=").status_code == 400
+
     def test_unknown_group(self, url):
         assert get(url, "/command/inquiry.cgi?inq=secrets").status_code == 400
 

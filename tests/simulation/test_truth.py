@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def path(fleet, tmp_path):
 class TestFile:
     def test_says_what_it_is(self, path):
         data = json.loads(path.read_text())
-        assert (data["schema"], data["version"]) == ("torchptz.truth", 1)
+        assert (data["schema"], data["version"]) == ("torchptz.truth", 2)
 
     def test_reads_back_exactly(self, fleet, path):
         truths = load_truth(path)
@@ -71,6 +72,18 @@ class TestFile:
         table = json.loads((tmp_path / "t.json").read_text())["cameras"][1]["table"]
         assert table[0]["magnification"] == 1
         assert table[-1]["magnification"] == pytest.approx(25)
+
+    def test_of_the_first_version_is_still_read(self, fleet, path):
+        data = json.loads(path.read_text())
+        data["version"] = 1
+        for camera in data["cameras"]:
+            del camera["optics"]["crop_from_units"], camera["image_size"]
+            for key in ("zoom_scale", "picture", "report_units_per_deg"):
+                del camera[key]
+        path.write_text(json.dumps(data))
+        for name, truth in load_truth(path).items():
+            now = CameraTruth.of(fleet.cameras[name])
+            assert truth == replace(now, report_units_per_deg=None)
 
     @pytest.mark.parametrize("text", ["{", "[]", '{"schema": "other", "version": 1}'])
     def test_other_files_are_refused(self, tmp_path, text):
@@ -131,3 +144,10 @@ class TestHead:
         assert pan == pytest.approx(0.3 / 14.4 / np.sqrt(12))
         assert tilt == pytest.approx(0.3 * 115 / 1800 / np.sqrt(12))
         assert load_truth(path)["b"].reading_sigma_deg() == (0, 0)
+
+    def test_what_is_told_more_coarsely_than_it_stops_errs_by_that_too(self, fleet):
+        camera = fleet.cameras["a"]
+        camera.report_units_per_deg = (5.0, 100.0)
+        pan, tilt = CameraTruth.of(camera).reading_sigma_deg()
+        assert pan == pytest.approx(np.hypot(0.3 / 14.4, 1 / 5) / np.sqrt(12))
+        assert tilt == pytest.approx(0.3 * 115 / 1800 / np.sqrt(12))

@@ -126,6 +126,18 @@ class TestLens:
         done(visca, clock, "8101043802ff")
         assert visca.inquire("81090438ff") == "905002ff"
 
+    def test_stabiliser(self, visca, clock):
+        assert visca.inquire("81090434ff") == "905002ff"
+        done(visca, clock, "8101043403ff")
+        assert visca.inquire("81090434ff") == "905003ff"
+        assert visca.camera.stabiliser is False
+
+    def test_no_position(self, visca):
+        visca.camera.set_faults(no_position=True)
+        for inquiry in ("81090612ff", "81090447ff"):
+            with pytest.raises(ViscaError, match="906141ff"):
+                visca.inquire(inquiry)
+
 
 @pytest.mark.parametrize(
     "message",

@@ -43,8 +43,8 @@ class Priors:
         roll_sigma: rad, of the sensor about the optical axis.
         pixel_aspect: width over height of a pixel.
         pixel_aspect_sigma: relative; 0: known.
-        axis_scale_sigma: relative, of pan and tilt; 0: the device's degrees are degrees. Where it
-            is not, the signs are open, too.
+        axis_scale_sigma: relative, of pan and tilt, (C, 2) where they differ; 0: the device's
+            degrees are degrees. Where it is not, the signs are open, too.
         backlash_sigma: rad, of the play's full width on either axis.
         pupil_m: m, how far the entrance pupil lies ahead of the head's axes.
         pupil_sigma_m: m.
@@ -204,8 +204,11 @@ def known_of(priors: Priors, observations: Observations, layout: Layout, used: T
         (at.LOG_ASPECT, "pixel_aspect_sigma"),
         (at.BACKLASH, "backlash_sigma"),
     ):
-        value = tensor(getattr(priors, name), name)
-        head_sigma[:, place] = value if isinstance(place, int) else value[:, None]
+        value = torch.as_tensor(getattr(priors, name))
+        # Of two axes, one number each where there are two.
+        width = (2,) if value.ndim == 2 else ()
+        value = tensor(value, name, *width)
+        head_sigma[:, place] = value if isinstance(place, int) or width else value[:, None]
 
     feature_mean = like.new_zeros(cameras, features, len(at.FEATURE))
     feature_sigma = torch.full_like(feature_mean, math.inf)

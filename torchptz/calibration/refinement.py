@@ -30,6 +30,7 @@ _DAMPING_AT_KINK = 5.0
 _CONVERGED, _SETTLED = 1e-4, 1e-9
 _SLACK = 1e-9  # relative, of the cost: rounding must not decide
 _KEPT = 0.25  # of a promised fall
+_OPPOSITE = 0.5  # cosine
 _SETTLED_NOISE = 1e-3  # relative change of a variance that matters
 _HEAVY = 4.0  # degrees of freedom of the Student weights
 _MEDIAN = 1.386  # of chi squared with two degrees of freedom
@@ -62,6 +63,7 @@ class _Progress(Batched):
     converged: Tensor
     active: Tensor
     play_held: Tensor  # (C,) bool
+    last: Tensor  # (C, T) the step before
 
 
 def refine(
@@ -108,6 +110,7 @@ def refine(
         torch.zeros(cameras, dtype=torch.bool, device=theta.device),
         problem.used.any(1),
         torch.zeros(cameras, dtype=torch.bool, device=theta.device),
+        torch.zeros_like(theta),
     )
     # Those that are done leave the batch; on another device that is a wait.
     steps = 1 if theta.device.type == "cpu" else _ROUND
@@ -140,7 +143,7 @@ def _advance(
     theta, noise, weight = progress.theta, progress.noise, progress.weight
     damping, iterations, active = progress.damping, progress.iterations, progress.active
     converged, free, used = progress.converged, known.free, problem.used
-    play_held, plays = progress.play_held, _plays(problem, theta)
+    play_held, plays, last = progress.play_held, _plays(problem, theta), progress.last
     for _ in range(steps):
         prediction = predict(problem, theta)
         residual = _residual(problem, prediction.pixel)
@@ -163,6 +166,7 @@ def _advance(
         undamped = _solve(matrix, right, torch.zeros_like(damping))
         promised = (right * undamped).sum(-1)
         step = _solve(matrix, right, damping)
+        step = torch.where(_returns(matrix, last, step)[:, None], step / 2, step)
         trial = _within(problem, theta + step)
 
         level = cost(weighed, metric, residual) + known.value(theta)
@@ -191,6 +195,7 @@ def _advance(
             change = torch.maximum(change, (wanted.pixel / noise.pixel).log().abs())
             noise = wanted.where(active, noise)
         theta = torch.where(better[:, None], trial, theta)
+        last = torch.where(better[:, None], step, last)
         damping = torch.where(better & kept_word, damping / 10, damping * 10)
         damping = damping.clamp_min(_DAMPING_LOWEST)
         kink = active & ~play_held & (damping > _DAMPING_AT_KINK)
@@ -199,7 +204,22 @@ def _advance(
         quiet = change < max(_SETTLED_NOISE, settled)
         converged = torch.where(active, (promised < _CONVERGED) & quiet, converged)
         active = active & ~((promised < settled) & quiet) & (damping < _DAMPING_HIGHEST)
-    return _Progress(theta, noise, weight, damping, iterations, converged, active, play_held)
+    return _Progress(theta, noise, weight, damping, iterations, converged, active, play_held, last)
+
+
+def _returns(matrix: Tensor, last: Tensor, step: Tensor) -> Tensor:
+    """(C,) bool, whether a step leads back where the one before came from.
+
+    The covariance follows the state, so that an unknown which hardly shows may be thrown from one
+    side of its place to the other, each step as good as its own covariance promised. Half of such
+    a step ends it.
+    """
+
+    def product(a: Tensor, b: Tensor) -> Tensor:
+        return (a * (matrix @ b.unsqueeze(-1)).squeeze(-1)).sum(-1)
+
+    size = (product(last, last).clamp_min(0) * product(step, step).clamp_min(0)).sqrt()
+    return product(last, step) < -_OPPOSITE * size
 
 
 def _summed_up(problem: Problem, progress: _Progress, known: Known) -> Refined:

@@ -1,8 +1,10 @@
 """Drivers for pan-tilt-zoom cameras over HTTP: one dialect a file, one factory for all."""
 
+import importlib
 import inspect
 from collections.abc import Callable
 
+from .axes import Axis, HeadAxes
 from .base import (
     AuthenticationError,
     BadPicture,
@@ -15,24 +17,52 @@ from .base import (
     Pose,
     ProtocolError,
 )
-from .sony import SonyRZ30Camera
+from .tls import Tls
+from .zoom_curve import ZoomCurve
 
 __all__ = [
     "DIALECTS",
     "AuthenticationError",
+    "Axis",
     "BadPicture",
     "Camera",
     "CameraError",
     "Capabilities",
     "ConnectionFailed",
     "Credentials",
+    "HeadAxes",
     "MotionError",
     "Pose",
     "ProtocolError",
+    "Tls",
+    "ZoomCurve",
+    "dialect_options",
     "open_camera",
 ]
 
-DIALECTS: dict[str, Callable[..., Camera]] = {"sony_rz30": SonyRZ30Camera}
+# Module and class of each dialect's driver; loaded when a camera speaks it.
+DIALECTS: dict[str, tuple[str, str]] = {
+    "axis": ("axis", "AxisCamera"),
+    "hikvision": ("hikvision", "HikvisionCamera"),
+    "onvif": ("onvif", "OnvifCamera"),
+    "sony_named": ("sony_named", "SonyNamedCamera"),
+    "sony_rz30": ("sony", "SonyRZ30Camera"),
+    "sony_srg": ("sony_named", "SonySRGCamera"),
+}
+# What every driver takes; the rest are options of its own.
+COMMON_OPTIONS = ("pan_sign", "tilt_sign", "tls", "connect_timeout_s", "read_timeout_s")
+
+
+def _driver(dialect: str) -> Callable[..., Camera]:
+    module, name = DIALECTS[dialect]
+    return getattr(importlib.import_module(f".{module}", __name__), name)
+
+
+def dialect_options(dialect: str) -> tuple[str, ...]:
+    """The options of a dialect's driver beside those that all have. Raises KeyError."""
+    parameters = inspect.signature(_driver(dialect)).parameters.values()
+    keywords = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    return tuple(name for name in keywords if name not in COMMON_OPTIONS)
 
 
 def open_camera(
@@ -43,17 +73,15 @@ def open_camera(
     options: the keyword arguments of the dialect's driver. Raises ValueError for an unknown
     dialect or option (listing the known ones) and for a malformed address.
     """
-    driver = DIALECTS.get(dialect)
-    if driver is None:
+    if dialect not in DIALECTS:
         raise ValueError(
             f"camera {name}: unknown dialect {dialect!r}; known are: {', '.join(sorted(DIALECTS))}"
         )
-    parameters = inspect.signature(driver).parameters.values()
-    known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    known = (*COMMON_OPTIONS, *dialect_options(dialect))
     for option in options:
         if option not in known:
             raise ValueError(
                 f"camera {name}: dialect {dialect} has no option {option!r}; "
                 f"its options are: {', '.join(known)}"
             )
-    return driver(name, address, credentials, **options)
+    return _driver(dialect)(name, address, credentials, **options)

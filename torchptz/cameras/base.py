@@ -6,6 +6,9 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from .axes import HeadAxes
+from .zoom_curve import ZoomCurve
+
 Angle = TypeVar("Angle", float, np.ndarray)
 
 
@@ -37,6 +40,11 @@ class Capabilities:
     horizontal_fov: float | None  # rad, at the widest zoom; a data sheet's value, roughly true
     reads_position: bool  # the device answers where it is
     reports_motion: bool  # the device answers whether it moves
+    pan_circular: bool = False  # a full turn of pan leads back: there is no limit
+    zoom_quantum: float = 0.0  # device units, the smallest step; 0: continuous
+    # How far the device's units may be off, one sigma: relative, of pan and tilt; rad
+    scale_sigma: tuple[float, float] = (0.0, 0.0)
+    tilt_zero_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         for axis in ("pan", "tilt"):
@@ -53,6 +61,8 @@ class Capabilities:
         pan, tilt: rad, floats or arrays of any shape (each axis keeps its own); returns the same
         kinds. A NaN stays a NaN.
         """
+        if self.pan_circular:
+            pan = (pan + math.pi) % (2 * math.pi) - math.pi
         return (
             _nearest_on_grid(pan, self.pan_limits, self.pan_quantum, self.pan_origin),
             _nearest_on_grid(tilt, self.tilt_limits, self.tilt_quantum, self.tilt_origin),
@@ -110,7 +120,18 @@ class Camera(Protocol):
     """One pan-tilt-zoom camera. Calls raise CameraError subclasses only."""
 
     name: str
-    capabilities: Capabilities
+    identity: str  # model, serial number, firmware, as the device says; "" where it does not
+    notes: list[str]  # what about the device a user should know, and what to do about it
+
+    axes: HeadAxes  # what the device's units mean; known once connected, as are the next two
+    zoom_curve: ZoomCurve
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What head and lens can reach."""
+
+    def connect(self) -> None:
+        """Ask the device what it is and what it can; call it first."""
 
     def move(self, pose: Pose) -> None:
         """Send the head to an absolute pose, all axes; returns before it has arrived."""
@@ -118,11 +139,22 @@ class Camera(Protocol):
     def position(self) -> Pose:
         """Where the device reads itself, in our signs; zoom in device units."""
 
+    def at_rest(self) -> bool | None:
+        """What the device said of its motion with the last position(); None: nothing. A claim."""
+
     def snapshot(self) -> np.ndarray:
         """One complete, decoded picture: (H, W, 3) uint8, BGR."""
 
     def prepare(self) -> None:
-        """Make the camera fit for measuring: optical zoom only, focus locked."""
+        """Make the camera fit for measuring: optical zoom only, overlays and stabiliser off, focus
+        locked, as far as it has the switches."""
+
+    def focus_once(self) -> float | None:
+        """One autofocus on what is seen now, then locked again; blocks until it is done. Returns
+        the focus that it found, in device units; None where it cannot be read, or not be set."""
+
+    def set_focus(self, focus: float) -> None:
+        """Go to a focus that focus_once() returned, and stay there."""
 
     def restore(self) -> None:
         """Put back what prepare() changed."""
@@ -135,3 +167,9 @@ class Camera(Protocol):
 
     def magnification(self, zoom_units: float) -> float:
         """Magnification (1 = widest) at device units, the inverse of zoom_units()."""
+
+    def learn(self, axes: HeadAxes | None = None, zoom: ZoomCurve | None = None) -> None:
+        """Take what pictures told of axes or zoom in place of what was believed."""
+
+    def restrict(self, *, margin: float = 0.0, max_magnification: float = math.inf) -> None:
+        """Show less in capabilities than the device can: rad kept from its limits, most zoom."""

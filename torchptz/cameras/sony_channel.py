@@ -2,16 +2,16 @@
 
 import logging
 import time
-from collections.abc import Callable
 
 from . import visca
 from .base import ProtocolError
+from .sony_settings import EXCLUSIVE_CONTROL, PathChoice
 from .transport import CameraTransport, Reply
 
 logger = logging.getLogger(__name__)
 
 _COMMAND_PATHS = ("/command/ptzf.cgi", "/command/visca-ptzf.cgi")  # firmware >= 1.10, <= 1.09
-_INQUIRY_PATHS = ("/command/visca-inquiry.cgi",)
+_INQUIRY_PATH = "/command/visca-inquiry.cgi"
 _BUFFER_FULL_ATTEMPTS, _BUFFER_FULL_PAUSE_S = 3, 0.1
 
 
@@ -20,16 +20,15 @@ class ViscaChannel:
 
     def __init__(self, transport: CameraTransport) -> None:
         self._transport = transport
-        self._found: dict[tuple[str, ...], str] = {}  # which of several paths this firmware has
+        self._command_path = PathChoice(*_COMMAND_PATHS)
 
     def command(self, command: str, *, repeatable: bool = True) -> None:
         """Send a VISCA command. All but the focus trigger name a target, not a change: to hear
         one twice does no more than to hear it once, so a lost one may be sent again.
         """
         for _ in range(_BUFFER_FULL_ATTEMPTS):
-            reply = self.first_found(
-                _COMMAND_PATHS,
-                lambda path: self._transport.get(f"{path}?visca={command}", repeatable=repeatable),
+            reply = self._command_path(
+                lambda path: self._transport.get(f"{path}?visca={command}", repeatable=repeatable)
             )
             if reply.status not in (200, 204):
                 raise self._transport.status_error(reply, f"the command {command}")
@@ -54,9 +53,7 @@ class ViscaChannel:
 
     def ask(self, inquiry: str, nibbles: int) -> bytes:
         """The data of the answer to a VISCA inquiry."""
-        reply = self.first_found(
-            _INQUIRY_PATHS, lambda path: self._transport.get(f"{path}?visca={inquiry}")
-        )
+        reply = self._transport.get(f"{_INQUIRY_PATH}?visca={inquiry}")
         if reply.status != 200:
             raise self._transport.status_error(reply, f"the inquiry {inquiry}")
         try:
@@ -74,18 +71,8 @@ class ViscaChannel:
 
     def _visca_error(self, fault: visca.ViscaError, request: str) -> ProtocolError:
         way_out = (
-            "wait until its motion ends, and see whether someone else steers it"
+            f"wait until its motion ends, see if someone else steers it, and {EXCLUSIVE_CONTROL}"
             if fault.code in (visca.BUFFER_FULL, visca.NOT_EXECUTABLE)
             else "check that it is an SNC-RZ30, with dialect sony_rz30"
         )
         return self._transport.error(ProtocolError, f"answered {request} with {fault}", way_out)
-
-    def first_found(self, paths: tuple[str, ...], request: Callable[[str], object]):
-        """The answer at the first path that this firmware has, remembered for the next time."""
-        known = self._found.get(paths)
-        for path in paths if known is None else (known,):
-            answer = request(path)
-            if not (isinstance(answer, Reply) and answer.status == 404):
-                self._found[paths] = path
-                break
-        return answer

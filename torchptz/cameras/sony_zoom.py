@@ -1,17 +1,17 @@
 """A nominal zoom curve for Sony block lenses: lens position against magnification.
 
 Half of the lens's travel makes the first 3x, so nothing about it is linear. The positions of 1x,
-2x .. 18x are published for the RZ25; the RZ30's table is not. Stretching the magnification by a
-power keeps the shape of the curve and meets both ends, 1x and 25x. The curve is only nominal:
-good enough to choose zooms by, while calibration measures what each position really magnifies.
+2x .. 18x are published for the RZ25; those of other lenses are not. Stretching the magnification
+by a power keeps the shape of the curve and meets both ends. The curve is only nominal: good
+enough to choose zooms by, while calibration measures what each position really magnifies.
 """
-
-import math
 
 import numpy as np
 
-ZOOM_RAW_LIMITS = (0, 0x4000)  # above is digital zoom, which no lens makes
-MAX_MAGNIFICATION = 25.0
+from .zoom_curve import ZoomCurve
+
+OPTICAL_LIMITS = (0, 0x4000)  # above is digital zoom, which no lens makes
+PUBLISHED_MAGNIFICATION = 18.0
 
 _POSITIONS = np.array(
     # 1x .. 9x
@@ -20,24 +20,22 @@ _POSITIONS = np.array(
      [14505, 14914, 15179, 15493, 15733, 15950, 16119, 16288, 16384]],
     dtype=np.float64,
 ).ravel()  # fmt: skip
-_LOG_MAGNIFICATIONS = np.log(np.arange(1, 19)) * (math.log(MAX_MAGNIFICATION) / math.log(18))
 
 
-def units_of(magnification: float) -> float:
-    """Lens position, device units, for a magnification of 1..25; linear in its logarithm.
+def curve(
+    max_magnification: float = PUBLISHED_MAGNIFICATION,
+    limits: tuple[float, float] = OPTICAL_LIMITS,
+    *,
+    known: bool = True,
+) -> ZoomCurve:
+    """The curve of a lens of so much magnification over so many device units.
 
-    Raises ValueError outside of that range.
+    known: False where the magnification itself is a guess. Raises ValueError for one of 1 or less.
     """
-    if not 1 - 1e-9 <= magnification <= MAX_MAGNIFICATION + 1e-9:
-        raise ValueError(f"no optical magnification of {magnification:g}")
-    return float(np.interp(math.log(magnification), _LOG_MAGNIFICATIONS, _POSITIONS))
-
-
-def magnification_of(units: float) -> float:
-    """Magnification at a lens position of 0..0x4000; the inverse of units_of().
-
-    Raises ValueError outside of that range, where the zoom is digital.
-    """
-    if not ZOOM_RAW_LIMITS[0] <= units <= ZOOM_RAW_LIMITS[1]:
-        raise ValueError(f"no optical zoom at {units:g} units")
-    return float(np.exp(np.interp(units, _POSITIONS, _LOG_MAGNIFICATIONS)))
+    if not max_magnification > 1:
+        raise ValueError(f"a zoom lens magnifies more than 1x, not {max_magnification:g}x")
+    power = np.log(max_magnification) / np.log(PUBLISHED_MAGNIFICATION)
+    low, high = limits
+    units = low + _POSITIONS * ((high - low) / _POSITIONS[-1])
+    magnifications = np.append(np.arange(1.0, PUBLISHED_MAGNIFICATION) ** power, max_magnification)
+    return ZoomCurve(tuple(units.tolist()), tuple(magnifications.tolist()), known)

@@ -14,6 +14,7 @@ import click
 
 from torchptz.cli.options import estimation_options
 from torchptz.cli.printing import counting, fleet_progress, one_line, print_summary
+from torchptz.cli.probing import probe
 
 # What takes long to load is imported where it is used.
 
@@ -64,6 +65,9 @@ def main(verbose: int) -> None:
     # The root logger stays at warnings: libraries have much to say about themselves.
     logging.basicConfig(format="%(asctime)s %(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     logging.getLogger("torchptz").setLevel(level)
+
+
+main.add_command(probe)
 
 
 @main.command()

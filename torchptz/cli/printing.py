@@ -90,9 +90,11 @@ def head_line(head: HeadResult) -> str:
         "tilt zero": angle(head.tilt_zero_deg, head.tilt_zero_sigma_deg),
         "boresight": angle(head.boresight_deg, head.boresight_sigma_deg),
         "roll": angle(head.roll_deg, head.roll_sigma_deg),
-        "backlash": " and ".join(map(angle, head.backlash_deg, head.backlash_sigma_deg)),
-        "readings good to": " and ".join(quanta),
     }
+    if head.backlash_deg is not None:
+        plays = map(angle, head.backlash_deg, head.backlash_sigma_deg)
+        values["backlash"] = " and ".join(plays)
+    values["readings good to"] = " and ".join(quanta)
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 

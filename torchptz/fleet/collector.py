@@ -9,39 +9,32 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from torchptz.cameras import Camera, CameraError, Pose, open_camera
-from torchptz.estimation import estimate_magnification, estimate_principal_point
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.designed import DesignedCollection
 from torchptz.fleet.journal import Journal
+from torchptz.fleet.probe import probe
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
+from torchptz.fleet.reference import ReferencePose
+from torchptz.fleet.survey import Survey
 from torchptz.patterns import LinePatterns
-from torchptz.scanning.approach import Approach, approach
-from torchptz.scanning.head_errors import HeadErrors
 from torchptz.scanning.line_scan import ScannedLine, View, plan_lines, scan_pattern
-from torchptz.scanning.observation import Observation, Observer, Stopped
+from torchptz.scanning.observation import Observer, Stopped
 from torchptz.scanning.prediction import ImagePredictor
-from torchptz.scanning.ray import FeatureRay, estimate_ray
-from torchptz.scanning.zoom_tracks import scan_tracks, track_levels
 
 logger = logging.getLogger(__name__)
 
 Progress = Callable[[str, str, int, int], None]  # camera, what, done, total
 
-# Quanta by which the head is moved to either side of the feature's ray at the longest zoom: enough
-# to average its rounding, little enough to stay where the lens hardly bends.
-_RAY_QUANTA = 3
-_RAY_STEP = math.radians(0.05)  # for heads without a known quantum
 _EXPECTED = (CameraError, ValueError, OSError, Stopped)  # by those who wrote the collector
-# Relative error of a focal length that comes over the zoom tracks: their outer ends, near the
-# border at the longest zoom, are bent by the lens there. 0.2 to 0.8 % on simulated lenses.
-_TRACKS_BEND = 0.005
-# Relative error of the longest focal length before it is measured there: from the wide end's by the
-# nominal magnification, or by the measured one (the first moves are of a few degrees only).
-_NOMINAL, _FIRST_MOVES = 0.1, 0.03
+# A step of the head by more than this share of the picture's shorter side is too coarse: lines
+# would be a few steps long, and the feature would be sought all over the picture.
+_COARSEST_STEP = 0.05
+_LEAST_REACH = 1.5  # magnification; a lens whose zoom tracks are shorter shows no principal point
+_MARGIN = math.radians(2)  # from the head's stops, where open-loop heads lose their zero
+_USUAL_FOV = math.radians(55)  # at the wide end, of a device that does not say
 _WIDEST_OVERSCAN = 1.08  # of the undistorted picture over the real one, before anything is seen
 
 
@@ -98,8 +91,13 @@ class Collector:
                 config.resolve_credentials(),
                 **config.driver_options(),
             )
+            camera.connect()
+            record.identity = camera.identity or None
+            for zoom in config.zooms:
+                camera.zoom_units(zoom)  # what the lens does not have is told before it moves
             start = camera.position()
             camera.prepare()
+            start = self._probe(camera, start, record)
             self._collect(camera, journal, record)
             record.finished = True
         except Exception as error:
@@ -122,103 +120,90 @@ class Collector:
     def _collect(self, camera: Camera, journal: Journal, record: CameraRecord) -> None:
         config = self._config
         timing = config.timing
+        # Chosen views choose the side that they are approached from, too.
+        designed = config.scan.design == "optimal"
+        overshoot = 0.0 if designed else math.radians(config.scan.overshoot_deg)
         observer = Observer(
-            camera, journal.write, self._stop, timing.settle_timeout_s, timing.poll_interval_s
+            camera,
+            journal.write,
+            self._stop,
+            timing.settle_timeout_s,
+            timing.poll_interval_s,
+            overshoot,
         )
         frame = camera.snapshot()
-        self._image_size = (frame.shape[1], frame.shape[0])
-        record.image_size = self._image_size
+        self._image_size = record.image_size = (frame.shape[1], frame.shape[0])
+        zooms = self._zooms_in_reach(camera, record)
         can = camera.capabilities
         record.quantum_deg = [math.degrees(can.pan_quantum), math.degrees(can.tilt_quantum)]
         record.max_magnification = can.max_magnification
+        record.overshoot_deg = math.degrees(overshoot)
+        record.axis_scale_sigma = list(can.scale_sigma)
+        record.tilt_zero_sigma_deg = math.degrees(can.tilt_zero_sigma)
         if can.horizontal_fov is not None:
             record.horizontal_fov_deg = math.degrees(can.horizontal_fov)
-
-        zooms = [camera.zoom_units(magnification) for magnification in config.zooms]
-        self._tell("finding the feature", 0, 1)
-        direction = config.feature.direction()
-        found = approach(observer, self._image_size, direction, config.pixel_aspect)
-        looks = self._look_around(observer, found)
-        middle = torch.tensor(self._image_size, dtype=torch.float64) / 2 - 0.5
-        rough = self._ray(looks, middle, found.focal_length, _NOMINAL, 0.0)
-
-        levels = track_levels(camera, zooms)
-        self._tell("following zoom tracks", 0, 1)
-        tracks = scan_tracks(
-            observer,
-            levels,
-            rough.ray,
-            rough.focal_length,
-            found.radius,
-            self._image_size,
-            config.scan.tracks,
-            config.pixel_aspect,
-        )
-        points = torch.from_numpy(tracks.points)[None]
-        mask = points.isfinite().all(-1)
-        points = points.nan_to_num(0.0)
-        meeting = estimate_principal_point(points, mask)
-        if not bool(meeting.covariance.isfinite().all()):
-            raise CameraError(
-                f"camera {config.name}: the zoom tracks do not meet in a point; the feature was "
-                f"found {int(mask.sum())} times on {config.scan.tracks} tracks"
-            )
-        pp, covariance = meeting.position[0], meeting.covariance[0]
-        magnification, magnification_sigma = estimate_magnification(points, mask, pp[None])
-        # Levels that no track reached keep their nominal magnification.
-        nominal = torch.tensor([camera.magnification(level) for level in levels])
-        reached = magnification[0].isfinite() & (magnification[0] > 0)
-        levelled = torch.where(reached, magnification[0], nominal.double())
-        relative = (levelled / levelled[-1]).tolist()
-        # The wide end's focal length, from the first moves, times the magnification just measured.
-        known = found.focal_length * float(levelled[-1] / nominal[-1])
-        pp_sigma = float(covariance.diagonal().max().sqrt())
-        ray = self._ray(looks, pp, known, _FIRST_MOVES, pp_sigma)
-        record.principal_point = pp.tolist()
-        record.principal_point_covariance = covariance.tolist()
-        record.ray, record.ray_sigma = ray.ray.tolist(), ray.ray_sigma
-        head_errors = HeadErrors(
-            ray.ray_sigma,
-            math.radians(config.head.tilt_zero_sigma_deg),
-            math.radians(config.head.boresight_sigma_deg),
-        )
-        record.head_errors = head_errors.by_source()
+        refused, record.zooms = record.zooms, []
+        survey = Survey(observer, config, self._image_size, record, self._tell)
+        surveyed = survey.run(zooms)
+        record.zooms = [*record.zooms, *refused]
         record.save(self._folder)
 
-        chosen: list[View] = []
-        for index, zoom in enumerate(zooms):
-            level = levels.index(zoom)
-            measured, focal_length = float(levelled[level]), ray.focal_length * relative[level]
-            spread = float(magnification_sigma[0, level]) if reached[level] else None
-            zoom_record = ZoomRecord(
-                nominal_zoom=config.zooms[index],
-                zoom_units=zoom,
-                magnification=measured,
-                magnification_sigma=spread,
-                focal_length_px=focal_length,
-            )
-            if spread is not None:
-                parts = (ray.focal_length_sigma / ray.focal_length, spread / measured, _TRACKS_BEND)
-                zoom_record.focal_length_sigma_px = focal_length * math.hypot(*parts)
-            record.zooms.append(zoom_record)
-            radius = tracks.radius[level]
-            view = View(
-                image_size=self._image_size,
-                principal_point=pp.numpy(),
-                focal_length=focal_length,
-                pixel_aspect=config.pixel_aspect,
-                zoom=zoom,
-                radius=float(radius if np.isfinite(radius) else found.radius * relative[level]),
-                head_errors=head_errors,
-            )
-            if config.scan.design == "optimal":
-                chosen.append(view)
-            else:
-                self._collect_zoom(observer, view, ray.ray, index, zoom_record, record)
-        if chosen:
+        reference = ReferencePose(observer, surveyed.found, config.pixel_aspect, record)
+        reference.visit()
+        if designed:
             DesignedCollection(
-                observer, chosen, ray.ray, record, self._folder, config.scan, self._tell
+                observer,
+                surveyed.views,
+                surveyed.ray,
+                record,
+                self._folder,
+                config.scan,
+                self._tell,
             ).run()
+            reference.visit()
+            return
+        for index, view in enumerate(surveyed.views):
+            self._collect_zoom(observer, view, surveyed.ray, index, record.zooms[index], record)
+            # A head that lost its place since then read poses that were not true.
+            reference.visit()
+
+    def _probe(self, camera: Camera, start: Pose, record: CameraRecord) -> Pose:
+        """Check with pictures what the camera says of itself; returns where it began, as its axes
+        were learnt."""
+        report = probe(camera, self._config, self._tell, short=True, stop=self._stop)
+        report.save(self._folder)
+        record.notes = [*camera.notes, *report.notes]
+        for note in record.notes:
+            logger.warning("camera %s: %s", self._config.name, note)
+        if report.refused is not None:
+            raise CameraError(report.refused)
+        # The pose is the same, and the zoom may be a digital one that prepare() ended.
+        return replace(camera.position(), zoom=start.zoom)
+
+    def _zooms_in_reach(self, camera: Camera, record: CameraRecord) -> list[float]:
+        """Nominal magnifications that the head is fine enough for; the record says of the others
+        why they are refused. Scanning keeps clear of the head's stops, too.
+        """
+        can, size = camera.capabilities, self._image_size
+        focal = size[0] / 2 / math.tan((can.horizontal_fov or _USUAL_FOV) / 2)
+        step = max(can.pan_quantum, can.tilt_quantum)
+        most = _COARSEST_STEP * min(size) / (focal * step) if step else math.inf
+        if most < _LEAST_REACH:
+            raise CameraError(
+                f"camera {self._config.name}: its head moves or reads in steps of "
+                f"{math.degrees(step):.2g} degrees, {focal * step:.0f} px at the widest zoom: too "
+                "coarse for any; see whether its dialect has finer units"
+            )
+        camera.restrict(margin=_MARGIN, max_magnification=most)
+        for zoom in self._config.zooms:
+            if zoom > most:
+                reason = (
+                    f"the head moves or reads in steps of {math.degrees(step):.2g} degrees, about "
+                    f"{focal * zoom * step:.0f} px at {zoom:g}x: too coarse beyond {most:.3g}x"
+                )
+                refused = ZoomRecord(nominal_zoom=zoom, magnification=zoom, error=reason)
+                record.zooms.append(refused)
+        return [zoom for zoom in self._config.zooms if zoom <= most]
 
     def _collect_zoom(
         self,
@@ -272,70 +257,6 @@ class Collector:
             raise
         finally:
             record.save(self._folder)
-
-    def _look_around(self, observer: Observer, found: Approach) -> list[Observation]:
-        """The feature at nine poses around the middle of the picture, at the longest zoom."""
-        can = observer.camera.capabilities
-        pan_step = _RAY_QUANTA * can.pan_quantum or _RAY_STEP
-        tilt_step = _RAY_QUANTA * can.tilt_quantum or _RAY_STEP
-        # A coarse quantum at a very long zoom must not drive the feature out of the picture.
-        room = 0.3 * min(self._image_size) / found.focal_length
-        pan_step, tilt_step = min(pan_step, room), min(tilt_step, room)
-        looks = []
-        for number, (x, y) in enumerate((x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)):
-            self._tell("reading the ray", number, 9)
-            pose = Pose(
-                *can.nearest_reachable(
-                    found.pose.pan + x * pan_step, found.pose.tilt + y * tilt_step
-                ),
-                found.pose.zoom,
-            )
-            # Away from the horizon a pan moves the picture by less than its angle.
-            moved = found.focal_length * np.array(
-                [
-                    x * pan_step * math.cos(found.pose.tilt),
-                    -y * tilt_step * self._config.pixel_aspect,
-                ]
-            )
-            middle = (np.asarray(self._image_size) - 1) / 2
-            seen = observer.look(
-                pose,
-                "ray",
-                near=tuple(middle + moved),
-                search_radius=0.3 * min(self._image_size),
-                expected_radius=found.radius,
-            )
-            if seen.found:
-                looks.append(seen)
-        return looks
-
-    def _ray(
-        self,
-        looks: list[Observation],
-        pp: torch.Tensor,
-        focal_length: float,
-        relative_sigma: float,
-        pp_sigma: float,
-    ) -> FeatureRay:
-        if len(looks) < 5:
-            raise CameraError(
-                f"camera {self._config.name}: the feature was found at only {len(looks)} of 9 "
-                "poses at the longest zoom; its ray cannot be trusted. Is something in front of it?"
-            )
-
-        def tensor(values: list) -> torch.Tensor:
-            return torch.tensor(values, dtype=torch.float64)
-
-        return estimate_ray(
-            tensor([one.read_after.pan for one in looks]),
-            tensor([one.read_after.tilt for one in looks]),
-            tensor([one.pixel for one in looks]),
-            pp,
-            focal_length,
-            focal_length * relative_sigma,
-            pp_sigma,
-            self._config.pixel_aspect,
-        )
 
     def _patterns(self, lines: list[ScannedLine]) -> LinePatterns:
         return LinePatterns.from_lists(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
-from torchptz.cameras import DIALECTS, Credentials
+from torchptz.cameras import DIALECTS, Credentials, dialect_options, open_camera
 from torchptz.cameras.wire import parse_address
 from torchptz.files import write_whole
 from torchptz.fleet.config_sections import (
@@ -21,6 +21,7 @@ from torchptz.fleet.config_sections import (
     ScanConfig,
     Section,
     TimingConfig,
+    TlsConfig,
 )
 from torchptz.fleet.yaml_config import (
     ConfigError,
@@ -42,6 +43,7 @@ __all__ = [
     "HeadConfig",
     "ScanConfig",
     "TimingConfig",
+    "TlsConfig",
     "check_name",
     "load_config",
     "parse_config",
@@ -51,7 +53,11 @@ _NAME = re.compile(r"\w[\w.-]{0,63}")
 _ONE_CAMERA_ONLY = ("name", "address")
 _OF_THE_HEAD = ("tilt_zero_sigma_deg", "boresight_sigma_deg")
 # One source of the password replaces the other, where a camera overrides the defaults.
-_ALTERNATIVES = (frozenset({"password_env", "password_file"}),)
+_ALTERNATIVES = (
+    frozenset({"password_env", "password_file"}),
+    frozenset({"ca_file", "fingerprint", "verify"}),
+)
+_FILES = (("credentials", "password_file"), ("tls", "ca_file"))  # relative to the configuration
 
 
 def check_name(name: str) -> str:
@@ -80,8 +86,14 @@ class CameraConfig(Section):
         min_length=1, description="nominal magnifications >= 1, ascending; 1 = widest"
     )
     pixel_aspect: float = Field(1.0, gt=0.5, lt=2, description="width over height of a pixel")
-    pan_sign: Literal[1, -1] = Field(1, description="-1: the pan axis runs the other way")
-    tilt_sign: Literal[1, -1] = Field(1, description="-1: the tilt axis runs the other way")
+    pan_sign: Literal[1, -1] | None = Field(
+        None, description="-1: the pan axis runs the other way; null: pictures tell"
+    )
+    tilt_sign: Literal[1, -1] | None = Field(
+        None, description="-1: the tilt axis runs the other way; null: pictures tell"
+    )
+    tls: TlsConfig | None = Field(None, description="https; null: no encryption")
+    device: dict[str, Any] = Field({}, description="options of the dialect's driver")
     head: HeadConfig = HeadConfig()
     scan: ScanConfig = ScanConfig()
     timing: TimingConfig = TimingConfig()
@@ -135,6 +147,24 @@ class CameraConfig(Section):
             raise ValueError(f"must be 1 or -1, not {value}")
         return value
 
+    @model_validator(mode="after")
+    def _known_options(self) -> CameraConfig:
+        known = dialect_options(self.dialect)
+        for option in self.device:
+            if option not in known:
+                has = f"its options are: {', '.join(known)}" if known else "it has none"
+                raise ValueError(
+                    f"device.{option}: dialect {self.dialect} has no such option"
+                    f"{nearest(option, known)}; {has}"
+                )
+        # The driver knows what its options may be; it sends nothing before it is asked to.
+        try:
+            open_camera(self.dialect, self.name, self.address, None, **self.driver_options())
+        except (TypeError, ValueError) as error:
+            text = str(error).removeprefix(f"camera {self.name}: ")
+            raise ValueError(f"device: {text}") from None
+        return self
+
     @field_validator("zooms")
     @classmethod
     def _ascending(cls, value: list[float]) -> list[float]:
@@ -146,9 +176,11 @@ class CameraConfig(Section):
         """The account to log in with, or None for none; see `CredentialsConfig.resolve`."""
         return None if self.credentials is None else self.credentials.resolve(self.name)
 
-    def driver_options(self) -> dict[str, float]:
+    def driver_options(self) -> dict[str, Any]:
         """What `open_camera` takes beside dialect, name, address and credentials."""
         return {
+            **self.device,
+            "tls": None if self.tls is None else self.tls.resolve(),
             "pan_sign": self.pan_sign,
             "tilt_sign": self.tilt_sign,
             "connect_timeout_s": self.timing.connect_timeout_s,
@@ -173,7 +205,9 @@ class FleetConfig(Section):
                     f"cameras[{i}].name: {camera.name} is the name of cameras[{other}] too; "
                     "names must be unique (capitals do not count)"
                 )
-            other = addresses.setdefault(parse_address(camera.name, camera.address).lower(), i)
+            usual_port = 80 if camera.tls is None else 443
+            address = parse_address(camera.name, camera.address, usual_port).lower()
+            other = addresses.setdefault(address, i)
             if other != i:
                 raise ValueError(
                     f"cameras[{i}].address: {camera.address} belongs to camera "
@@ -242,9 +276,12 @@ def parse_config(
 
 def _complete(defaults: dict, camera: object, folder: str | Path | None) -> object:
     camera = merged(defaults, camera, _ALTERNATIVES)
-    account = camera.get("credentials") if isinstance(camera, dict) else None
-    file = account.get("password_file") if isinstance(account, dict) else None
-    if folder is None or not isinstance(file, str):
+    if folder is None or not isinstance(camera, dict):
         return camera
-    path = Path(folder).resolve() / Path(file).expanduser()
-    return {**camera, "credentials": {**account, "password_file": str(path)}}
+    for section, key in _FILES:
+        inside = camera.get(section)
+        file = inside.get(key) if isinstance(inside, dict) else None
+        if isinstance(file, str):
+            path = Path(folder).resolve() / Path(file).expanduser()
+            camera = {**camera, section: {**inside, key: str(path)}}
+    return camera

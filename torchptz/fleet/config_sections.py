@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from torchptz.cameras import Credentials
+from torchptz.cameras import Credentials, Tls
 from torchptz.fleet.yaml_config import ConfigError
 
 _VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -77,6 +77,29 @@ class CredentialsConfig(Section):
         if problem is not None:
             raise ConfigError(f"camera {camera}: the password file {path} {problem}")
         return Credentials(self.user, lines[0])
+
+
+class TlsConfig(Section):
+    """An encrypted connection, and how its certificate is checked: by the system's authorities, by
+    one of its own, or by the certificate's own fingerprint.
+    """
+
+    ca_file: str | None = Field(
+        None, description="file (PEM) of the authority, relative to the configuration"
+    )
+    fingerprint: str | None = Field(
+        None, description="SHA-256 of the camera's certificate, 64 hexadecimal digits"
+    )
+    verify: bool = Field(True, description="false: believe any certificate; better pin it")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> TlsConfig:
+        self.resolve()  # knows what contradicts what
+        return self
+
+    def resolve(self) -> Tls:
+        """As the driver takes it."""
+        return Tls(self.verify, self.ca_file, self.fingerprint)
 
 
 class FeatureConfig(Section):
@@ -159,6 +182,13 @@ class ScanConfig(Section):
     vertical: int = Field(10, ge=0, le=200, description="vertical lines")
     oblique: int = Field(0, ge=0, le=200, description="lines along both diagonals")
     points_per_line: int = Field(20, ge=5, le=500, description="points on each line")
+    overshoot_deg: float = Field(
+        0.5,
+        ge=0,
+        le=10,
+        description="degrees; poses on lines are approached from below on both axes, from so far, "
+        "more than the head's play; 0: from wherever the head is",
+    )
     tracks: int = Field(
         8, ge=2, le=100, description="places in the picture that the lens zooms at, for its axis"
     )

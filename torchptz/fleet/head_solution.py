@@ -87,7 +87,7 @@ def _solution(record: CameraRecord, observations: Observations, one: Calibration
     return Solution(
         tuple(zooms),
         tuple(knots),
-        head=_head(one, observations.quantum[0]),
+        head=_head(one, observations.quantum[0], record.overshoot_deg > 0),
         # Without what no camera can know: it says nothing of this one.
         undetermined=tuple(str(thing) for thing in one.undetermined[0] if not thing.gauge),
     )
@@ -166,8 +166,8 @@ def _zoom(
     return result, knot
 
 
-def _head(one: Calibration, quantum: Tensor) -> HeadResult:
-    """quantum: (2,) rad."""
+def _head(one: Calibration, quantum: Tensor, one_sided: bool) -> HeadResult:
+    """quantum: (2,) rad. one_sided: every look was approached from the same side."""
 
     def degrees(*values: Tensor) -> tuple[float, ...]:
         return tuple(math.degrees(value) for value in values)
@@ -182,8 +182,10 @@ def _head(one: Calibration, quantum: Tensor) -> HeadResult:
         boresight_sigma_deg=math.degrees(sigma["boresight"]),
         roll_deg=roll,
         roll_sigma_deg=math.degrees(sigma["roll"]),
-        backlash_deg=degrees(*one.backlash[0]),
-        backlash_sigma_deg=degrees(sigma["pan backlash"], sigma["tilt backlash"]),
+        backlash_deg=None if one_sided else degrees(*one.backlash[0]),
+        backlash_sigma_deg=None
+        if one_sided
+        else degrees(sigma["pan backlash"], sigma["tilt backlash"]),
         reading_sigma_deg=degrees(*noise),
         reading_sigma_quanta=tuple(
             float(n / q) if q > 0 else None for n, q in zip(noise, quantum, strict=True)

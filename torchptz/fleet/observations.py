@@ -14,8 +14,9 @@ from torchptz.scanning.observation import Observation
 
 OBSERVATIONS_NAME = "observations.npz"
 
-# While the feature is still sought, what is seen may be something else.
-_SOUGHT = "locate"
+# While the feature is still sought, what is seen may be something else; and visits of the reference
+# pose check what is estimated from the others.
+_NOT_COUNTED = ("locate", "reference")
 # The head was sent to the same place in the lens's range, but for rounding.
 _SAME_UNITS = 1e-6  # of the units
 # Readings that are multiples of a step but for this part of it come from a head of that quantum.
@@ -33,8 +34,8 @@ def observed(folder: Path, record: CameraRecord) -> dict:
 
     Every look moved the head, so every look is there. As found count those at the zooms that the
     record has and at the longest one, which tells most about the head; those at other zooms, and
-    those of the search for the feature, keep their place as if they had found nothing. The reading
-    is the mean of those before and after the pictures.
+    those of the search for the feature and of the reference pose, keep their place as if they had
+    found nothing. The reading is the mean of those before and after the pictures.
 
     Args:
         folder: of the camera in the run.
@@ -49,7 +50,7 @@ def observed(folder: Path, record: CameraRecord) -> dict:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
     zoom = _magnifications(looks, record)
-    counts = np.array([one.found and one.purpose != _SOUGHT for one in looks], dtype=bool)
+    counts = np.array([one.found and one.purpose not in _NOT_COUNTED for one in looks], dtype=bool)
     counts &= np.isfinite(zoom)
     if record.image_size is None or not counts.any():
         raise ValueError(f"{path}: the feature was found at none of the zooms that were asked for")

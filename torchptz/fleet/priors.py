@@ -42,17 +42,29 @@ def priors_of(records: Sequence[CameraRecord], observations: Observations) -> Pr
         """(C,) rad."""
         return of_camera([getattr(head, name) for head in heads], radians=True)[:, 0]
 
+    # Play that is always on one side is part of the tilt's zero and of the features' pans.
+    play = angle("backlash_sigma_deg")
+    one_sided = torch.tensor([record.overshoot_deg > 0 for record in records])
+    shifted = torch.where(one_sided, play / 2, 0.0)
+    # Two sources of one error: what the configuration allows, and what the device leaves open.
+    open_zero = of_camera([record.tilt_zero_sigma_deg for record in records], radians=True)[:, 0]
+    measured = [max(record.measured_repeatability_deg or [0.0]) for record in records]
+    measured = of_camera(measured, radians=True)[:, 0]
+
     return Priors(
         focal_length=width / (2 * torch.tan(fov / 2)) * observations.zooms,
         focal_length_sigma=_FOV_SIGMA,
-        tilt_zero_sigma=angle("tilt_zero_sigma_deg"),
+        tilt_zero_sigma=torch.hypot(angle("tilt_zero_sigma_deg"), torch.hypot(open_zero, shifted)),
+        axis_scale_sigma=torch.tensor(
+            [record.axis_scale_sigma for record in records], dtype=torch.float64
+        ),
         boresight_sigma=angle("boresight_sigma_deg"),
         roll_sigma=angle("roll_sigma_deg"),
-        backlash_sigma=angle("backlash_sigma_deg"),
+        backlash_sigma=torch.where(one_sided, 0.0, play),
         pixel_aspect=of_camera([record.pixel_aspect for record in records])[:, 0],
         pupil_m=of_camera([head.pupil_m for head in heads]),
         pupil_sigma_m=of_camera([head.pupil_sigma_m for head in heads]),
         distance_m=distance,
         distance_sigma_m=torch.where(spread.isnan(), usual, spread),
-        repeatability=angle("repeatability_deg"),
+        repeatability=torch.maximum(angle("repeatability_deg"), measured),
     )

@@ -56,10 +56,19 @@ class ZoomRecord(_Record):
         return value
 
 
+class ReferenceVisit(_Record):
+    """Where the feature was seen at the pose that is revisited."""
+
+    taken_at: float  # s since the epoch
+    shift_px: Pair  # px since the first visit, but for what the readings tell
+
+
 class CameraRecord(_Record):
     """One camera: what was measured at which zoom, and what went wrong."""
 
     name: str
+    identity: str | None = None  # model, serial number, firmware, as the device says
+    notes: list[str] = []  # what about the device its user should know
     image_size: tuple[int, int] | None = None  # px, width and height; None: never sent a picture
     pixel_aspect: float = Field(1.0, gt=0)
     principal_point: Pair | None = None  # px
@@ -70,11 +79,19 @@ class CameraRecord(_Record):
     # ``systematic`` has them
     head_errors: dict[str, Annotated[float, Field(ge=0)]] = {}
     quantum_deg: Pair | None = None  # smallest steps of pan and tilt, 0: continuous; None: unknown
+    # How far the device's units may be off, one sigma: relative, of pan and tilt; degrees
+    axis_scale_sigma: Pair = [0.0, 0.0]
+    tilt_zero_sigma_deg: float = Field(0.0, ge=0)
+    # Looks were approached upwards from so far, so that play shows nowhere; 0: from either side
+    overshoot_deg: float = Field(0.0, ge=0)
+    measured_repeatability_deg: Pair | None = None  # of pan and tilt, by pictures
     horizontal_fov_deg: float | None = Field(None, gt=0, lt=180)  # widest zoom, by the data sheet
     max_magnification: float | None = Field(None, gt=0)  # nominal, of the longest zoom
     feature: FeatureConfig | None = None
     head: HeadConfig = HeadConfig()
     zooms: list[ZoomRecord] = []
+    reference: list[ReferenceVisit] = []
+    untrue: str | None = None  # why nothing that was collected is to be trusted
     views_ended: str | None = None  # why no more views were chosen; None: lines were scanned
     error: str | None = None  # why the camera failed
     finished: bool = False  # False while collection runs, and where it was interrupted

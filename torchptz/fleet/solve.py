@@ -139,7 +139,7 @@ def _records(run: Path, cameras: Sequence[str] | None) -> dict[str, CameraRecord
 
 def _written(path: Path, record: CameraRecord, solution: Solution) -> CameraResult:
     """What became of a camera, its table written if it has a lens."""
-    error = record.error or solution.error
+    error = record.error or record.untrue or solution.error
     if error is None and not record.finished:
         error = "collection was interrupted; the table has what was finished"
     if error is None and not solution.zooms:
@@ -147,7 +147,7 @@ def _written(path: Path, record: CameraRecord, solution: Solution) -> CameraResu
     # The table of an earlier run must not pass for this one's.
     path.unlink(missing_ok=True)
     table = None
-    if any(knot.usable for knot in solution.knots):
+    if record.untrue is None and any(knot.usable for knot in solution.knots):
         try:
             ZoomTable(
                 record.name,

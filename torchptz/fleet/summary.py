@@ -49,8 +49,9 @@ class HeadResult:
     boresight_sigma_deg: float
     roll_deg: float  # the picture's content turned clockwise
     roll_sigma_deg: float
-    backlash_deg: tuple[float, float]  # full width of the play of pan and tilt
-    backlash_sigma_deg: tuple[float, float]
+    # Full width of the play of pan and tilt; None: all looks were approached from one side
+    backlash_deg: tuple[float, float] | None
+    backlash_sigma_deg: tuple[float, float] | None
     reading_sigma_deg: tuple[float, float]  # noise of what pan and tilt read, as found
     reading_sigma_quanta: tuple[float | None, float | None]  # None: a continuous axis
 

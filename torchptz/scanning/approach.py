@@ -84,6 +84,7 @@ def approach(
             near=tuple(middle),
             search_radius=0.2 * image_size[0],
             expected_radius=last.radius * ratio,
+            direct=True,
         )
         if not seen.found:
             raise FeatureNotFound(
@@ -115,7 +116,7 @@ def _find(
         if beyond or pose in visited:
             continue
         visited.add(pose)
-        seen = observer.look(pose, "locate")
+        seen = observer.look(pose, "locate", direct=True)
         if seen.found:
             return seen
         reasons.append(seen.reason)
@@ -152,6 +153,7 @@ def _probe(
         near=tuple(at),
         search_radius=float(3 * np.linalg.norm(expected)),
         expected_radius=seen.radius,
+        direct=True,
     )
     if not probed.found:
         raise FeatureNotFound(

@@ -96,6 +96,8 @@ class ViewScan:
             near=lambda at: tuple(expected(at)[0].tolist()),
             search_radius=radius,
             expected_radius=view.radius,
+            # The design chose from where each stop is approached, and tells the play by it.
+            direct=True,
         )
         if seen.found:
             self._misses = 0

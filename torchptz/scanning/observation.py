@@ -12,39 +12,25 @@ import numpy as np
 
 from torchptz.cameras import Camera, MotionError, Pose
 from torchptz.scanning.detection import Detection, NotFound, detect_ball
-from torchptz.scanning.stillness import pictures_still
+from torchptz.scanning.focus import FocusPerZoom
+from torchptz.scanning.head_motion import HeadMotion, Stopped
+from torchptz.scanning.stillness import pictures_still, view_motion
+
+__all__ = ["WAY", "Observation", "Observer", "Stopped"]
 
 _MOST_PICTURES = 12  # per look; a picture that moves for longer will not come to rest
 _MOST_RETURNS = 3  # per look, after somebody else moved the head
 _STILL_PX = 0.5  # the feature's largest move between two pictures of a head at rest
-# A head that has not arrived and whose readings do not change is given this long to (re)start.
-_PATIENCE_S = 2.0
-_THERE_QUANTA = 0.6
-# A head that stops beside its target is good enough: its reading says where it is. It is at rest if
-# it stays; until then it may be creeping there, or, where it was not seen to move, not yet off.
-_BESIDE_QUANTA = 5.1
-_BESIDE_S = 0.6
-_NOT_OFF_S = 1.0
-# Two readings closer than this are one: at rest a reading may flicker by a count.
-_FLICKER_QUANTA = 1.1
-_ZOOM_ARRIVAL = 0.003  # of the zoom range
-_ZOOM_FLICKER = 0.0005  # of the zoom range
-# A continuous axis has no quantum; its readings are good to about this.
-_FINEST = 1e-4  # rad
-
-
-class Stopped(Exception):
-    """The run was asked to stop."""
-
-    def __init__(self) -> None:
-        super().__init__("stopped before it was finished")
+_TELLING_PX = 4.0  # a move of the head by so much must show in the picture
+_USUAL_FOV = math.radians(55)  # at the wide end, of a device that does not say
+WAY = "way"  # purpose of a stop that was made on the way to a pose
 
 
 @dataclass(frozen=True)
 class Observation:
     """One look at a feature, with all that later estimators may want to know of it."""
 
-    purpose: str  # "locate", "ray", "track" or "line"
+    purpose: str  # "locate", "ray", "track", "line", "view", "reference", or "way": no look at all
     zoom_index: int  # zoom level for "line", track level for "track", else -1
     group: int  # line or track number, else 0
     commanded: Pose  # rad, rad, device units
@@ -76,7 +62,7 @@ class Observer:
 
     What a device says of its own motion is not trusted: the head is at rest when its readings
     agree to a quantum, it is where it was sent or stays within 5 quanta of that, and two pictures
-    in a row show the same.
+    in a row show the same, and something else than before a move.
 
     Args:
         camera: connected camera.
@@ -84,6 +70,7 @@ class Observer:
         stop: set by others to end the run; raises Stopped at the next step.
         settle_timeout_s: longest wait for a head to arrive.
         poll_interval_s: between two readings.
+        overshoot: rad, see `HeadMotion`.
     """
 
     def __init__(
@@ -93,49 +80,17 @@ class Observer:
         stop: threading.Event,
         settle_timeout_s: float = 20.0,
         poll_interval_s: float = 0.05,
+        overshoot: float = 0.0,
     ) -> None:
         self.camera = camera
         self._record = record
-        self._stop = stop
-        self._timeout = settle_timeout_s
-        self._poll = poll_interval_s
+        self._head = HeadMotion(camera, stop, settle_timeout_s, poll_interval_s, overshoot)
+        self._focus = FocusPerZoom(camera)
+        self._last: tuple[np.ndarray, Pose] | None = None  # picture and reading of the last look
 
     def go(self, pose: Pose) -> Pose:
-        """Send the head to a pose and wait until its readings are stable there.
-
-        Returns:
-            The reading, within about 5 quanta of the pose on either axis.
-
-        Raises:
-            MotionError: it did not move, stopped elsewhere or never came to rest.
-        """
-        if self._stop.is_set():
-            raise Stopped
-        self.camera.move(pose)
-        # Time counts from here: a camera that is slow to reply has not begun to move before.
-        started = changed = time.monotonic()
-        first = anchor = None  # anchor: the reading that later ones are the same as
-        while True:
-            if self._stop.is_set():
-                raise Stopped
-            reading = self.camera.position()
-            first = first or reading
-            now = time.monotonic()
-            late = anchor is not None and now - started > self._timeout
-            if anchor is None or not self._same(reading, anchor):
-                anchor, changed = reading, now
-            elif self._arrived(reading, pose, now - changed, self._same(reading, first)):
-                return reading
-            # Two equal readings alone show nothing: a slow head's are whole quanta.
-            if now - changed > (min(_PATIENCE_S, self._timeout / 2) if late else _PATIENCE_S):
-                moved = not self._same(reading, first)
-                raise MotionError(self._not_there(pose, reading, moved))
-            if late:
-                raise MotionError(
-                    f"{self._name}: the head was still moving {self._timeout:g} s after a move; "
-                    "is a tour or another user driving it? (timing.settle_timeout_s)"
-                )
-            time.sleep(self._poll)
+        """As `HeadMotion.go`."""
+        return self._head.go(pose)
 
     def look(
         self,
@@ -147,6 +102,7 @@ class Observer:
         near: tuple[float, float] | Callable[[Pose], tuple[float, float]] | None = None,
         search_radius: float | None = None,
         expected_radius: float | None = None,
+        direct: bool = False,
     ) -> Observation:
         """Go to a pose and measure the feature in two pictures that agree.
 
@@ -155,19 +111,24 @@ class Observer:
             purpose, zoom_index, group: written down with the observation.
             near, search_radius, expected_radius: px, see `detect_ball`. near may be a function of
                 the reading, for a head that stops beside its target.
+            direct: go there from wherever the head is, not upwards on both axes.
 
         Returns:
             Observation, also of a feature that was not found.
 
         Raises:
-            MotionError: the head or the picture does not come to rest.
+            MotionError: the head or the picture does not come to rest, or the picture does not
+                follow the head.
         """
-        before, returns = self.go(pose), 0
+        before, returns = self._arrive(pose, direct), 0
+        stale = self._must_have_changed(before)
         last: tuple[np.ndarray, Detection | NotFound] | None = None
         for _ in range(_MOST_PICTURES):
-            if self._stop.is_set():
-                raise Stopped
+            self._head.check_stop()
             frame = self.camera.snapshot()
+            if stale and self._is_old_view(frame):
+                continue  # from a buffer: it was taken before the head moved
+            stale = False
             seen = detect_ball(
                 frame,
                 near=near(before) if callable(near) else near,
@@ -178,7 +139,8 @@ class Observer:
                 last = (frame, seen)
                 continue
             after = self.camera.position()
-            if self._same(before, after):
+            if self._head.same(before, after):
+                self._last = (frame, after)
                 return self._observation(
                     pose, before, after, last[1], seen, purpose, zoom_index, group
                 )
@@ -186,18 +148,54 @@ class Observer:
             returns += 1
             if returns > _MOST_RETURNS:
                 raise MotionError(
-                    f"{self._name}: the head was moved {returns} times while it should be at "
+                    f"{self._head.name}: the head was moved {returns} times while it should be at "
                     "rest; is a tour, a tracker or another user driving it?"
                 )
-            before, last = self.go(pose), None
+            before, last = self._arrive(pose, direct), None
+        if stale:
+            raise MotionError(
+                f"{self._head.name}: the head reads that it moved and the picture still shows the "
+                "view from before; is the picture frozen, or the position that it reads not true?"
+            )
         raise MotionError(
-            f"{self._name}: the picture did not come to rest in {_MOST_PICTURES} pictures; is the "
-            "feature swinging, the mast shaking, or the image stabiliser on?"
+            f"{self._head.name}: the picture did not come to rest in {_MOST_PICTURES} pictures; is "
+            "the feature swinging, the mast shaking, or the image stabiliser on?"
         )
 
-    @property
-    def _name(self) -> str:
-        return f"camera {self.camera.name}"
+    def _arrive(self, pose: Pose, direct: bool) -> Pose:
+        """Go to a pose, upwards unless directly, and see that it is focused at its zoom."""
+        via = None if direct else self._head.way_to(pose)
+        if via is not None:
+            stop = self.go(via)
+            # Later estimators must know from where the head came.
+            self._record(_on_the_way(via, stop, self._head.rest_rule(stop, via)))
+        reading = self.go(pose)
+        self._focus.at(pose.zoom)
+        return reading
+
+    def _must_have_changed(self, now: Pose) -> bool:
+        """Whether the head has moved since the last look by more than a picture could hide."""
+        if self._last is None:
+            return False
+        before, can = self._last[1], self.camera.capabilities
+        width = self._last[0].shape[1]
+        ratio = self.camera.magnification(now.zoom) / self.camera.magnification(before.zoom)
+        if abs(math.log(ratio)) > _TELLING_PX / (width / 4):
+            return True
+        focal = width / 2 / math.tan((can.horizontal_fov or _USUAL_FOV) / 2)
+        pan = math.remainder(now.pan - before.pan, 2 * math.pi) * math.cos(now.tilt)
+        turned = math.hypot(pan, now.tilt - before.tilt)
+        return turned * focal * self.camera.magnification(now.zoom) > _TELLING_PX
+
+    def _is_old_view(self, frame: np.ndarray) -> bool:
+        """Whether a picture shows what the last look saw; nothing is said without texture."""
+        old = self._last[0]
+        if old.shape != frame.shape:
+            return False
+        if np.array_equal(old, frame):
+            return True
+        motion = view_motion(old, frame, _STILL_PX)
+        return motion.textured and not motion.changed and motion.moved < _STILL_PX
 
     def _observation(
         self,
@@ -232,51 +230,29 @@ class Observer:
             radius=radius,
             quality=quality,
             reason=reason,
-            rest_rule=self._rest_rule(before, pose),
+            rest_rule=self._head.rest_rule(before, pose),
             taken_at=time.time(),
         )
         self._record(observation)
         return observation
 
-    def _same(self, a: Pose, b: Pose) -> bool:
-        """Whether two readings are the same but for a flicker."""
-        quanta, zoom = self._apart(a, b)
-        return quanta <= _FLICKER_QUANTA and zoom <= _ZOOM_FLICKER
 
-    def _arrived(self, reading: Pose, pose: Pose, unchanged_s: float, as_first: bool) -> bool:
-        """Whether a reading is near enough to a pose, after it did not change for a time.
-
-        as_first: it still is the one right after the command.
-        """
-        beside = unchanged_s > (_NOT_OFF_S if as_first else _BESIDE_S)
-        quanta, zoom = self._apart(reading, pose)
-        return quanta <= (_BESIDE_QUANTA if beside else _THERE_QUANTA) and zoom <= _ZOOM_ARRIVAL
-
-    def _apart(self, a: Pose, b: Pose) -> tuple[float, float]:
-        """Quanta on the axis where two poses differ more, and the share of the zoom range."""
-        can = self.camera.capabilities
-        pan = abs(math.remainder(a.pan - b.pan, 2 * math.pi)) / max(can.pan_quantum, _FINEST)
-        tilt = abs(a.tilt - b.tilt) / max(can.tilt_quantum, _FINEST)
-        zoom_range = can.zoom_limits[1] - can.zoom_limits[0]
-        return max(pan, tilt), abs(a.zoom - b.zoom) / zoom_range
-
-    def _rest_rule(self, before: Pose, pose: Pose) -> str:
-        quanta, _ = self._apart(before, pose)
-        where = "at the target" if quanta <= _THERE_QUANTA else f"{quanta:.1f} quanta beside it"
-        return f"readings agree to a quantum, {where}; pictures agree"
-
-    def _not_there(self, pose: Pose, reading: Pose, moved: bool) -> str:
-        def text(p: Pose) -> str:
-            return (
-                f"pan {math.degrees(p.pan):.2f}°, tilt {math.degrees(p.tilt):.2f}°, "
-                f"zoom {p.zoom:.0f}"
-            )
-
-        what = "stopped elsewhere" if moved else "does not move"
-        return (
-            f"{self._name}: the head {what}: sent to {text(pose)}, reads {text(reading)}; is it "
-            "blocked, at a stop, locked by another user, or in exclusive control mode?"
-        )
+def _on_the_way(via: Pose, reading: Pose, rest_rule: str) -> Observation:
+    return Observation(
+        purpose=WAY,
+        zoom_index=-1,
+        group=0,
+        commanded=via,
+        read_before=reading,
+        read_after=reading,
+        pixel=None,
+        sigma=None,
+        radius=None,
+        quality=None,
+        reason="a stop on the way",
+        rest_rule=rest_rule,
+        taken_at=time.time(),
+    )
 
 
 def _agree(

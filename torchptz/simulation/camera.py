@@ -5,23 +5,29 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
-from math import radians
+from math import atan, pi, radians
 from threading import Lock
 
 import cv2
 import numpy as np
 
 from .config import CameraConfig, FaultConfig
-from .head import Head
-from .optics import DIGITAL_UNITS, OPTICAL_UNITS, LensState, Optics, digital_factor
+from .focus import Focus
+from .head import FLIP_TILT, Head
+from .optics import DIGITAL_UNITS, OPTICAL_UNITS, LensState, Optics
+from .picture_faults import clock_text, crop, hunting, shaken, turned, upside_down
 from .scene import World, draw_text
 from .texture import Background
 from .view import HeadPose, Mount, View
+from .zoom_scale import scale_of
 
 STEP, MARGIN = 8, 8  # px between the nodes where rays are computed, and px beyond the border
 NOISE_SLACK = 64  # px by which a noise picture may be shifted
 CACHED_ZOOMS = 32
+NOISE_PICTURES, NOISE_PIXELS = 6, 2_400_000  # fewer of large pictures, though two at least
+HIDDEN_CROP_FROM = 0.75 * OPTICAL_UNITS
 
 
 class SimulatedCamera:
@@ -49,30 +55,104 @@ class SimulatedCamera:
         self.head = Head(config.head, config.seed, clock)
         self.digital_zoom = False
         self.set_digital_zoom(config.digital_zoom)
-        self.faults = config.faults
+        self.focus = Focus(self.head.time)
+        self.overlay = True  # the switch of what is written into the picture
+        self.stabiliser = True  # its switch
+        self.zoom_scale = scale_of(config.dialect, self.optics)
+        self.report_units_per_deg: tuple[float, float] | None = None
+        self.faults = FaultConfig()
         self.on_faults: list[Callable[[FaultConfig], None]] = []  # told after every change
         self._background = Background(config.seed)
         self._lock = Lock()
-        self._frames = 0
+        self._frames = self._moves = self._stale = 0
+        self._pose_before: HeadPose | None = None  # the last command
+        self._frozen: HeadPose | None = None  # position
         self._grids: OrderedDict[float, np.ndarray] = OrderedDict()
+        self.set_faults(**config.faults.model_dump())
 
     def set_faults(self, **changes: object) -> None:
         """Switches faults at run time, by the names in FaultConfig; raises ValueError on others."""
-        self.faults = FaultConfig.model_validate({**self.faults.model_dump(), **changes})
+        faults = FaultConfig.model_validate({**self.faults.model_dump(), **changes})
+        with self._lock:
+            if not faults.frozen_position:
+                self._frozen = None
+            elif self._frozen is None:
+                self._frozen = self.head.reading()
+            end = HIDDEN_CROP_FROM if faults.digital_zoom_hidden else float(OPTICAL_UNITS)
+            self.optics = replace(self.optics, crop_from_units=end)
+            self.head.set_faults(faults)
+            self.faults = faults
         for listener in self.on_faults:
-            listener(self.faults)
+            listener(faults)
 
     def set_digital_zoom(self, on: bool) -> None:
         self.digital_zoom = on
         self.head.set_zoom_limit(DIGITAL_UNITS if on else OPTICAL_UNITS)
 
     def move_to(self, pan: float, tilt: float, pan_speed: float, tilt_speed: float) -> None:
-        """Starts a pan-tilt move (rad, rad/s) unless the head is stuck."""
-        if not self.faults.head_stuck:
+        """Starts a pan-tilt move (rad, rad/s), unless a fault swallows it."""
+        self._commanded()
+        with self._lock:
+            self._moves += 1
+            every = self.faults.ignore_move_every
+            ignored = every and self._moves % every == 0
+        if not (ignored or self.faults.head_stuck):
             self.head.move_to(pan, tilt, pan_speed, tilt_speed)
+
+    def zoom_to(self, body_units: float, share: float = 1.0) -> None:
+        """Starts a zoom move, in the zoom motor's units; share of the fastest speed."""
+        self._commanded()
+        self.head.zoom_to(body_units, share)
+
+    def stop(self, pan_tilt: bool = True, zoom: bool = True) -> None:
+        """Stops at the next position where the motors can."""
+        if pan_tilt:
+            self.head.stop()
+        if zoom:
+            self.head.zoom_stop()
+
+    def reading(self) -> HeadPose | None:
+        """The pose as the device would tell it (rad, body zoom units); None: it has none today."""
+        if self.faults.no_position:
+            return None
+        pose = self._frozen or self.head.reading()
+        if self.faults.pan_reading_0_360:
+            pose = pose._replace(pan=-(-pose.pan % (2 * pi)))
+        return pose
+
+    def moving(self) -> bool:
+        """Whether the device claims to move."""
+        if self.faults.stuck_moving or self.faults.always_idle:
+            return self.faults.stuck_moving
+        return self.head.motors_run()
+
+    @property
+    def pan_limits(self) -> tuple[float, float]:
+        """rad; of a circular pan one turn."""
+        return tuple(radians(a) for a in self.config.head.pan_limits_deg)
+
+    @property
+    def tilt_limits(self) -> tuple[float, float]:
+        """rad"""
+        return tuple(radians(a) for a in self.config.head.tilt_limits_deg)
+
+    @property
+    def pan_circular(self) -> bool:
+        return self.config.head.pan_circular
+
+    @property
+    def max_speeds(self) -> tuple[float, float]:
+        """rad/s of pan and tilt."""
+        return tuple(radians(a) for a in self.config.head.max_speed_deg)
+
+    def horizontal_fov(self, zoom_units: float) -> float:
+        """rad, at a zoom in the motor's units."""
+        return 2 * atan(self.config.image_size[0] / 2 / self.optics.at(zoom_units).focal_length)
 
     def true_pose(self, pan: float, tilt: float, zoom_units: float) -> HeadPose:
         """The true pose behind settled readings (rad), without jitter and play: adds tilt zero."""
+        pan = -pan if self.faults.pan_reversed else pan
+        tilt = -tilt if self.faults.tilt_reversed else tilt
         return HeadPose(pan, tilt + radians(self.config.head.tilt_zero_deg), float(zoom_units))
 
     def view(self, pose: HeadPose) -> View:
@@ -90,32 +170,58 @@ class SimulatedCamera:
             raise ValueError(f"{self.name}: its scene has no board; add one under scene.board")
         return self.view(pose).project(self.world.board.corners())
 
-    def snapshot(self) -> bytes:
-        """JPEG of the head's true state now; successive pictures carry different noise."""
+    def snapshot(self, overlay: bool | None = None) -> bytes:
+        """JPEG of the head's true state now; successive pictures carry different noise.
+
+        overlay: whether this picture has what is written into pictures; None: as it is switched.
+        """
+        pose = self.head.true_pose()
         with self._lock:
             number, self._frames = self._frames, self._frames + 1
-        frame = self.render(self.head.true_pose(), number)
+            if self._stale:
+                self._stale, pose = self._stale - 1, self._pose_before
+        frame = self.render(pose, number, self.head.time(), overlay)
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
         return cv2.imencode(".jpg", frame, quality)[1].tobytes()
 
-    def render(self, pose: HeadPose, number: int = 0) -> np.ndarray:
+    def render(
+        self, pose: HeadPose, number: int = 0, moment: float = 0.0, overlay: bool | None = None
+    ) -> np.ndarray:
         """(H, W, 3) uint8 BGR at a true pose (rad, zoom units), before JPEG.
 
-        `number` chooses the noise: the same camera, pose and number give the same frame.
+        `number` chooses the noise and `moment` (s, the head's clock) the state of what changes by
+        itself: the same camera, pose, number and moment give the same frame.
         """
-        pose = HeadPose(*pose)
-        optical = min(pose.zoom_units, OPTICAL_UNITS)
-        view = self.view(pose._replace(zoom_units=optical))
-        frame = self._draw_background(view, pose._replace(zoom_units=optical))
-        self.world.draw(frame, view, self.config.psf_px, ball=not self.faults.ball_hidden)
+        faults = self.faults
+        lens_units, factor = self.optics.crop(HeadPose(*pose).zoom_units)
+        pose = HeadPose(*pose)._replace(zoom_units=lens_units)
+        view = self.view(pose)
+        frame = self._draw_background(view, pose)
+        self.world.draw(frame, view, self.config.psf_px, ball=not faults.ball_hidden)
+        if faults.focus_hunting and self.focus.searching():
+            frame = hunting(frame, moment)
         if self.config.noise_dn:
             frame = self._with_noise(frame, number)
-        crop = digital_factor(pose.zoom_units)
-        if crop > 1:
-            frame = _crop(frame, crop)
-        if self.world.text:
-            draw_text(frame, self.world.text)
+        if faults.eis_jitter_px and self.stabiliser:
+            frame = shaken(frame, faults.eis_jitter_px, [self.config.seed, 11, number])
+        if factor > 1:
+            frame = crop(frame, factor)
+        if faults.auto_flip and pose.tilt > FLIP_TILT:
+            frame = upside_down(frame)
+        frame = turned(frame, faults.picture_rotation, faults.mirrored)
+        if self.overlay if overlay is None else overlay:
+            texts = (self.world.text, clock_text(moment) if faults.osd else None)
+            text = "  ".join(one for one in texts if one)
+            if text:
+                draw_text(frame, text)
         return frame
+
+    def _commanded(self) -> None:
+        """Notes the view before a command, which stale pictures go on to show."""
+        if self.faults.stale_frames:
+            pose = self.head.true_pose()
+            with self._lock:
+                self._pose_before, self._stale = pose, self.faults.stale_frames
 
     def _draw_background(self, view: View, pose: HeadPose) -> np.ndarray:
         plain = self.config.scene.plain_background
@@ -160,18 +266,11 @@ def _pan_back(pan: float) -> np.ndarray:
     return np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
 
 
-def _crop(frame: np.ndarray, factor: float) -> np.ndarray:
-    """The digital zoom: enlarges about the image centre."""
-    height, width = frame.shape[:2]
-    x, y = (width - 1) / 2, (height - 1) / 2
-    matrix = np.array([[1 / factor, 0, x - x / factor], [0, 1 / factor, y - y / factor]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(frame, matrix, (width, height), flags=flags)
-
-
 @lru_cache(maxsize=4)
 def _noise_bank(size: tuple[int, int], sigma: float) -> np.ndarray:
     """Noise pictures shared by all cameras of a kind; drawing fresh ones costs 10 ms a frame."""
     rng = np.random.default_rng(8)
-    shape = (6, size[1] + NOISE_SLACK, size[0] + NOISE_SLACK, 3)
-    return np.rint(rng.standard_normal(shape, np.float32) * sigma).astype(np.int8)
+    shape = (size[1] + NOISE_SLACK, size[0] + NOISE_SLACK, 3)
+    count = min(max(NOISE_PIXELS // (shape[0] * shape[1]), 2), NOISE_PICTURES)
+    pictures = (rng.standard_normal(shape, np.float32) for _ in range(count))
+    return np.stack([np.rint(picture * sigma).astype(np.int8) for picture in pictures])

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
-PositiveFloat = Annotated[float, Field(gt=0)]
-NonNegativeFloat = Annotated[float, Field(ge=0)]
-Pair = tuple[float, float]
-
+from .bodies import BODIES
+from .faults import FaultConfig
+from .settings import NonNegativeFloat, Pair, PositiveFloat, Section
 
 _ASIDE_DEG = 55.0
 
@@ -20,14 +19,11 @@ class SimulationError(RuntimeError):
     """A simulated fleet cannot be configured or started; the message says why and the way out."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class LensConfig(_Section):
+class LensConfig(Section):
     """The optics. What is left out is drawn from the camera's seed."""
 
-    f_wide_px: PositiveFloat | None = None  # about 738 px for 736 px of width
+    f_wide_px: PositiveFloat | None = None  # else drawn about that of horizontal_fov_deg
+    horizontal_fov_deg: Annotated[float, Field(gt=5, lt=120)] | None = None  # None: about 53
     max_magnification: Annotated[float, Field(gt=1, le=60)] = 25.0
     principal_point_offset_px: Pair | None = None  # from the image centre
     barrel_wide: Annotated[float, Field(ge=0, le=0.12)] | None = None  # share of r at a corner, 1x
@@ -35,7 +31,7 @@ class LensConfig(_Section):
     centre_drift_px: NonNegativeFloat | None = None  # distortion centre from the principal point
 
 
-class BallConfig(_Section):
+class BallConfig(Section):
     """The bright ball that the cameras look at; directions in the head's signs (left, down > 0)."""
 
     pan_deg: float = 0.0
@@ -47,7 +43,7 @@ class BallConfig(_Section):
     side_light: Annotated[float, Field(ge=0, le=0.3)] = 0.0  # lit from above: moves the centroid
 
 
-class BoardConfig(_Section):
+class BoardConfig(Section):
     """A plane checkerboard that faces the camera, turned by three angles about its centre."""
 
     pan_deg: float = 0.0  # left out: _ASIDE_DEG beside the ball
@@ -60,7 +56,7 @@ class BoardConfig(_Section):
     roll_deg: float = 0.0
 
 
-class HighlightConfig(_Section):
+class HighlightConfig(Section):
     """A bright thing that is not the ball: elongated, or of another size; infinitely far away."""
 
     pan_deg: float
@@ -71,7 +67,7 @@ class HighlightConfig(_Section):
     brightness: Annotated[float, Field(ge=0, le=255)] = 215.0
 
 
-class SceneConfig(_Section):
+class SceneConfig(Section):
     ball: BallConfig = BallConfig()
     board: BoardConfig | None = BoardConfig()
     highlights: list[HighlightConfig] | None = None  # None: three, drawn from the seed
@@ -89,12 +85,21 @@ class SceneConfig(_Section):
         return self
 
 
-class HeadConfig(_Section):
-    """Mechanics and imperfections. Everything that is an imperfection is zero by default."""
+class HeadConfig(Section):
+    """Mechanics and imperfections. Everything that is an imperfection is zero by default.
+
+    What is said of a model's head (quanta, limits, speeds) is here that of the SNC-RZ30P; bodies.py
+    has those of the other dialects.
+    """
 
     speed_up: PositiveFloat = 1.0  # all the head's times are divided by this
     pan_units_per_deg: PositiveFloat = 14.4  # the head stops at multiples of 1/this
     tilt_units_per_deg: PositiveFloat = 1800 / 115
+    pan_limits_deg: Pair = (-170.0, 170.0)
+    pan_circular: bool = False  # without an end: the limits do not count, moves go the short way
+    tilt_limits_deg: Pair = (-25.0, 90.0)
+    tilt_origin_deg: float = 27.9  # where the tilt motor counts zero, and where it is switched on
+    max_speed_deg: tuple[PositiveFloat, PositiveFloat] = (300.0, 125.0)  # deg/s, pan and tilt
     acceleration_deg: PositiveFloat = 600.0  # deg/s^2
     zoom_units_per_s: PositiveFloat = 5500.0
     zoom_delay_s: NonNegativeFloat = 0.1
@@ -122,24 +127,29 @@ OF_THE_BODY = (
 )
 
 
-class FaultConfig(_Section):
-    """What goes wrong on the wire or in the head; each may also be switched at run time."""
+class LoginConfig(Section):
+    """How the device asks for its login, where that is not fixed by the dialect."""
 
-    truncated_jpeg_every: Annotated[int, Field(ge=0)] = 0  # every Nth picture ends half-way
-    ball_hidden: bool = False
-    head_stuck: bool = False  # accepts pan and tilt commands and does not move
-    refuse_connections: bool = False  # does not listen
-    double_cr: bool = False  # header lines end in CR CR LF
-    slow_reply_s: NonNegativeFloat = 0.0  # every reply waits so long (wall clock)
+    schemes: tuple[Literal["basic", "digest"], ...] | None = None  # None: the dialect's own
+    algorithm: Literal["MD5", "SHA-256"] = "MD5"  # of digest
+    nonce_lifetime_s: PositiveFloat = 300.0
+    lockout_s: PositiveFloat = 1800.0  # how long a lock-out lasts, see FaultConfig.lockout_after
 
 
-class CameraConfig(_Section):
+class CameraConfig(Section):
     name: Annotated[str, Field(min_length=1)]
-    dialect: Literal["sony_rz30"] = "sony_rz30"
+    dialect: Literal["sony_rz30", "sony_named", "sony_srg", "axis", "onvif", "hikvision"] = (
+        "sony_rz30"
+    )
+    dialect_options: dict[str, Any] = Field(
+        default_factory=dict
+    )  # given to the dialect as they are
+    tls: bool = False  # https, with a certificate of its own making
     port: Annotated[int, Field(ge=0, le=65535)] = 0  # 0: any free port
     image_size: tuple[Annotated[int, Field(ge=64)], Annotated[int, Field(ge=64)]] = (736, 544)
     user: str | None = "admin"  # None: no login asked
     password: str = Field(default="admin", repr=False)
+    login: LoginConfig = LoginConfig()
     seed: Annotated[int, Field(ge=0)] = 0
     digital_zoom: bool = True  # state at power-on
     noise_dn: NonNegativeFloat = 2.0  # sensor noise, one sigma
@@ -150,8 +160,27 @@ class CameraConfig(_Section):
     head: HeadConfig = HeadConfig()
     faults: FaultConfig = FaultConfig()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _body_of_the_dialect(cls, given: Any) -> Any:
+        # Only what is left open; an unknown dialect is for its own field to refuse.
+        if not isinstance(given, dict):
+            return given
+        dialect = given.get("dialect", cls.model_fields["dialect"].default)
+        body = BODIES.get(dialect) if isinstance(dialect, str) else None
+        if body is None:
+            return given
+        filled = {"image_size": body.image_size, **given}
+        for name, usual in (("head", body.head), ("lens", body.lens)):
+            section = given.get(name, {})
+            if isinstance(section, BaseModel):
+                section = section.model_dump(exclude_unset=True)
+            if isinstance(section, dict):
+                filled[name] = {**usual, **section}
+        return filled
 
-class SimulationConfig(_Section):
+
+class SimulationConfig(Section):
     """A fleet of simulated cameras."""
 
     cameras: Annotated[list[CameraConfig], Field(min_length=1)]

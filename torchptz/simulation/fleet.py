@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 
 import cv2
@@ -12,10 +13,35 @@ import cv2
 from .camera import SimulatedCamera
 from .config import SimulationConfig, SimulationError
 from .server import DeviceServer, Dialect
-from .sony_rz30 import SonyRz30
 from .truth import write_truth
 
-DIALECTS: dict[str, Callable[[SimulatedCamera], Dialect]] = {"sony_rz30": SonyRz30}
+# name -> module of this package and class; imported when a camera speaks it
+DIALECTS = {
+    "sony_rz30": ("sony_rz30", "SonyRz30"),
+    "sony_named": ("sony_named", "SonyNamed"),
+    "sony_srg": ("sony_named", "SonySrg"),
+    "axis": ("axis_vapix", "AxisVapix"),
+    "onvif": ("onvif_device", "OnvifDevice"),
+    "hikvision": ("hikvision_isapi", "HikvisionIsapi"),
+}
+
+
+def dialect_of(camera: SimulatedCamera) -> Dialect:
+    """The dialect that a camera's configuration names, with its options.
+
+    Raises SimulationError for options that the dialect does not have.
+    """
+    module, name = DIALECTS[camera.config.dialect]
+    make = getattr(import_module(f".{module}", __package__), name)
+    try:
+        dialect = make(camera, **camera.config.dialect_options)
+    except (TypeError, ValueError) as error:
+        raise SimulationError(
+            f"{camera.name}: the dialect {camera.config.dialect} does not take its options "
+            f"({error}); correct dialect_options"
+        ) from error
+    camera.report_units_per_deg = getattr(dialect, "report_units_per_deg", None)
+    return dialect
 
 
 class SimulatedFleet:
@@ -33,7 +59,7 @@ class SimulatedFleet:
         self.config = SimulationConfig.load(config)
         self.cameras = {c.name: SimulatedCamera(c, clock) for c in self.config.cameras}
         self._servers = {
-            c.name: DeviceServer(self.cameras[c.name], DIALECTS[c.dialect](self.cameras[c.name]))
+            c.name: DeviceServer(self.cameras[c.name], dialect_of(self.cameras[c.name]))
             for c in self.config.cameras
         }
         self._started = False
@@ -46,6 +72,12 @@ class SimulatedFleet:
                 "the simulated fleet has no addresses before start(); start it, or use `with`"
             )
         return {name: server.address for name, server in self._servers.items()}
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Camera name -> SHA-256 of its certificate (hex), of the cameras that speak TLS."""
+        named = {name: server.fingerprint for name, server in self._servers.items()}
+        return {name: fingerprint for name, fingerprint in named.items() if fingerprint}
 
     def start(self) -> SimulatedFleet:
         # many small pictures at once: a thread pool per picture only costs
@@ -65,13 +97,21 @@ class SimulatedFleet:
 
     def set_faults(self, name: str, **changes: object) -> None:
         """Switches faults of one camera at run time, by their names in the configuration."""
-        if name not in self.cameras:
-            raise SimulationError(f"{name}: no such simulated camera; have {sorted(self.cameras)}")
+        self._known(name)
         self.cameras[name].set_faults(**changes)
+
+    def rejected_logins(self, name: str) -> int:
+        """How many requests came to a camera with a wrong name or password."""
+        return self._servers[self._known(name)].rejected_logins
 
     def write_truth(self, path: str | Path, zoom_units: Sequence[float] | None = None) -> None:
         """Writes every camera's true optics and imperfections; see torchptz.simulation.truth."""
         write_truth(path, self.cameras.values(), zoom_units)
+
+    def _known(self, name: str) -> str:
+        if name not in self.cameras:
+            raise SimulationError(f"{name}: no such simulated camera; have {sorted(self.cameras)}")
+        return name
 
     def __enter__(self) -> SimulatedFleet:
         return self.start()

@@ -2,54 +2,33 @@
 
 The motors follow a trapezoid to a multiple of their quantum. The truth behind the reading differs
 by play (backlash), by the stop's own error (jitter), by the tilt's zero, and swings for a moment
-after arrival. With every imperfection at zero, truth and reading agree once the head has settled.
+after arrival. With every imperfection at zero, truth and reading agree once the head has settled;
+what the faults do to the head comes on top.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from math import copysign, exp, pi, radians, sin
 from threading import RLock
 
 import numpy as np
 
 from .config import HeadConfig
+from .faults import FaultConfig
+from .head_axis import HeadAxis, wrapped
 from .motion import Leg
 from .optics import OPTICAL_UNITS
 from .view import HeadPose
 
-PAN_LIMITS = (-radians(170), radians(170))  # our signs: left is positive
-TILT_LIMITS = (-radians(25), radians(90))  # our signs: down is positive
-TILT_ORIGIN = radians(27.9)  # tilt at which the tilt motor counts zero
+TILT_ORIGIN = radians(27.9)  # tilt at which the SNC-RZ30P's tilt motor counts zero
 RING_PERIODS = 4.0  # swings within the ring's time
 RING_SHARE = 0.05  # of the move, for moves too short to excite the full ring
-
-
-@dataclass(frozen=True)
-class _Axis:
-    """A pan or tilt axis (rad): the current leg and what the truth adds to it."""
-
-    leg: Leg
-    limits: tuple[float, float]
-    quantum: float
-    origin: float  # one position where the axis can stop
-    play: float  # full width of the backlash
-    load: float  # where the load lay within the play when the leg began, absolute
-    error: tuple[float, float] = (0.0, 0.0)  # true stop minus reading, before and after the leg
-
-    def snapped(self, target: float) -> float:
-        """The nearest position within the limits where the motor can stop."""
-        low = np.ceil((self.limits[0] - self.origin) / self.quantum - 1e-6)
-        high = np.floor((self.limits[1] - self.origin) / self.quantum + 1e-6)
-        steps = np.clip(np.round((target - self.origin) / self.quantum), low, high)
-        return float(self.origin + steps * self.quantum)
-
-    def load_at(self, now: float) -> float:
-        """The load follows the motor only when the play between them is used up."""
-        motor = self.leg.position(now)
-        return min(max(self.load, motor - self.play / 2), motor + self.play / 2)
+COAST_SHARE = 0.25  # the same for coasting
+FLIP_TILT = radians(85)
+SLOWEST = radians(0.01)  # per s
+OPERATOR_DEG = ((5.0, 15.0), (2.0, 6.0))  # how far somebody else moves pan and tilt
 
 
 class Head:
@@ -67,15 +46,47 @@ class Head:
         self._clock = clock
         self._rng = np.random.default_rng([seed, 2])
         self._lock = RLock()
-        now = self._now()
-        pan_q = radians(1 / config.pan_units_per_deg)
-        tilt_q = radians(1 / config.tilt_units_per_deg)
-        pan_play, tilt_play = (radians(b) for b in config.backlash_deg)
-        self._pan = _Axis(_standing(0.0, now), PAN_LIMITS, pan_q, 0.0, pan_play, 0.0)
-        self._tilt = _Axis(
-            _standing(TILT_ORIGIN, now), TILT_LIMITS, tilt_q, TILT_ORIGIN, tilt_play, TILT_ORIGIN
+        self._faults = FaultConfig()
+        self._chance = np.random.default_rng([seed, 10])  # of the faults
+        now = self._clock() * config.speed_up
+        limits = config.pan_limits_deg, config.tilt_limits_deg
+        units = config.pan_units_per_deg, config.tilt_units_per_deg
+        self._home = 0.0, radians(config.tilt_origin_deg)
+        self._pan, self._tilt = (
+            HeadAxis(
+                _standing(home, now),
+                tuple(radians(limit) for limit in ends),
+                radians(1 / per_deg),
+                home,
+                radians(play),
+                home,
+                circular=circular,
+            )
+            for home, ends, per_deg, play, circular in zip(
+                self._home,
+                limits,
+                units,
+                config.backlash_deg,
+                (config.pan_circular, False),
+                strict=True,
+            )
         )
         self._zoom = _standing(0.0, now)
+        self._commanded = self._drifts_from = self._operated = now
+        self._is_home = False
+
+    def set_faults(self, faults: FaultConfig) -> None:
+        """Takes over the faults; one that is switched on begins now, off it leaves no trace."""
+        with self._lock:
+            now, old, self._faults = self._now(), self._faults, faults
+            if faults.drift_deg_per_minute != old.drift_deg_per_minute:
+                self._drifts_from = now
+            if faults.return_home_s != old.return_home_s:
+                self._command(now)
+            if faults.second_operator_s != old.second_operator_s:
+                self._operated = now
+            if not faults.zero_loss_deg:
+                self._pan, self._tilt = self._pan.found_again(), self._tilt.found_again()
 
     def move_to(self, pan: float, tilt: float, pan_speed: float, tilt_speed: float) -> None:
         """Starts a move to a pose (rad) at speeds (rad/s) and returns; targets are clipped.
@@ -85,32 +96,30 @@ class Head:
         """
         with self._lock:
             now = self._now()
-            goals = self._pan.snapped(pan), self._tilt.snapped(tilt)
-            at_goal = self._pan.leg.goal, self._tilt.leg.goal
-            if max(abs(g - a) for g, a in zip(goals, at_goal, strict=True)) < 1e-9:
-                return
-            self._pan = self._start(self._pan, goals[0], pan_speed, now)
-            self._tilt = self._start(self._tilt, goals[1], tilt_speed, now)
+            self._command(now)
+            self._go(pan, tilt, pan_speed, tilt_speed, now)
 
     def stop(self) -> None:
         """Stops pan and tilt at the next position where the motors can stop."""
         with self._lock:
             now = self._now()
-            goals = [self._halt(axis, now) for axis in (self._pan, self._tilt)]
-            self.move_to(*goals, pan_speed=1.0, tilt_speed=1.0)
+            self._command(now)
+            coast = radians(self._faults.coast_deg)
+            goals = [axis.halt(now, coast) for axis in (self._pan, self._tilt)]
+            self._start_both(*goals, 1.0, 1.0, now)
 
     def zoom_to(self, units: float, speed_share: float = 1.0) -> None:
         """Starts a zoom move, clipped to the present range; speed as a share of the fastest."""
         with self._lock:
             now = self._now()
+            self._command(now)
             goal = float(round(min(max(units, 0.0), self.zoom_limit)))
-            speed = self.config.zoom_units_per_s * speed_share
-            begin = now + self.config.zoom_delay_s
-            self._zoom = Leg(self._zoom.position(now), goal, begin, speed)
+            self._zoom = self._zoom_leg(goal, speed_share, now)
 
     def zoom_stop(self) -> None:
         with self._lock:
             now = self._now()
+            self._command(now)
             self._zoom = _standing(float(round(self._zoom.position(now))), now)
 
     def set_zoom_limit(self, limit: float) -> None:
@@ -126,15 +135,19 @@ class Head:
             now = self._now()
             pan = self._pan.snapped(self._pan.leg.position(now))
             tilt = self._tilt.snapped(self._tilt.leg.position(now))
-            return HeadPose(pan, tilt, float(round(self._zoom.position(now))))
+            return HeadPose(wrapped(pan), tilt, float(round(self._zoom.position(now))))
 
     def true_pose(self) -> HeadPose:
         """The pose of the mechanical axes at this instant (rad, zoom units)."""
         with self._lock:
-            now = self._now()
-            pan = self._true(self._pan, now)
-            tilt = self._true(self._tilt, now) + radians(self.config.tilt_zero_deg)
-            return HeadPose(pan, tilt, self._zoom.position(now))
+            now, faults = self._now(), self._faults
+            drift = radians(faults.drift_deg_per_minute) * (now - self._drifts_from) / 60
+            pan = self._true(self._pan, now) * (-1 if faults.pan_reversed else 1) + drift
+            tilt = self._true(self._tilt, now) * (-1 if faults.tilt_reversed else 1) + drift
+            tilt += radians(self.config.tilt_zero_deg)
+            if faults.auto_flip and tilt > FLIP_TILT:
+                pan += pi
+            return HeadPose(wrapped(pan), tilt, self._zoom.position(now))
 
     def moving(self) -> bool:
         """Whether anything still moves, the swing after arrival included."""
@@ -143,46 +156,97 @@ class Head:
             settled = max(a.leg.end + self._ring_time(a) for a in (self._pan, self._tilt))
             return now < max(settled, self._zoom.end)
 
-    def _now(self) -> float:
+    def motors_run(self) -> bool:
+        """Whether a motor still runs, which is all that a device can know."""
+        with self._lock:
+            now = self._now()
+            return now < max(leg.end for leg in (self._pan.leg, self._tilt.leg, self._zoom))
+
+    def time(self) -> float:
+        """s on the head's clock."""
         return self._clock() * self.config.speed_up
 
-    def _start(self, axis: _Axis, goal: float, speed: float, now: float) -> _Axis:
+    def _now(self) -> float:
+        """The present, after what the head has done by itself until then."""
+        now, faults = self.time(), self._faults
+        due = self._commanded + faults.return_home_s
+        if faults.return_home_s and now >= due and not self._is_home:
+            self._is_home = True
+            self._go(*self._home, *self._fastest(), due)
+            self._zoom = self._zoom_leg(0.0, 1.0, due)
+        if faults.second_operator_s:
+            turns = int((now - self._operated) / faults.second_operator_s)
+            if turns:
+                self._operated += turns * faults.second_operator_s
+                self._operate(self._operated)
+        return now
+
+    def _command(self, now: float) -> None:
+        self._commanded, self._is_home = now, False
+
+    def _operate(self, now: float) -> None:
+        """Somebody else moves the head, some degrees either way."""
+        goals = []
+        for axis, (least, most) in zip((self._pan, self._tilt), OPERATOR_DEG, strict=True):
+            way = self._chance.uniform(least, most) * self._chance.choice([-1.0, 1.0])
+            goals.append(axis.leg.position(now) + radians(way))
+        self._go(*goals, *self._fastest(), now)
+
+    def _fastest(self) -> tuple[float, float]:
+        return tuple(radians(speed) for speed in self.config.max_speed_deg)
+
+    def _go(self, pan: float, tilt: float, pan_speed: float, tilt_speed: float, now: float) -> None:
+        goals = self._aimed(self._pan, pan, now), self._aimed(self._tilt, tilt, now)
+        self._start_both(*goals, pan_speed, tilt_speed, now)
+
+    def _aimed(self, axis: HeadAxis, target: float, now: float) -> float:
+        """Where a move to a target ends."""
+        goal = axis.goal(target, now)
+        way = goal - axis.leg.position(now)
+        if not self._faults.coast_deg or abs(way) < axis.quantum / 2:
+            return goal
+        coast = radians(self._faults.coast_deg) * self._chance.uniform(0.5, 1.0)
+        return axis.snapped(goal + copysign(min(coast, COAST_SHARE * abs(way)), way))
+
+    def _start_both(
+        self, pan: float, tilt: float, pan_speed: float, tilt_speed: float, now: float
+    ) -> None:
+        if abs(pan - self._pan.leg.goal) < 1e-9 and abs(tilt - self._tilt.leg.goal) < 1e-9:
+            return
+        speeds = (
+            min(max(speed, SLOWEST), most)
+            for speed, most in zip((pan_speed, tilt_speed), self._fastest(), strict=True)
+        )
+        self._pan = self._start(self._pan, pan, next(speeds), now)
+        self._tilt = self._start(self._tilt, tilt, next(speeds), now)
+
+    def _start(self, axis: HeadAxis, goal: float, speed: float, now: float) -> HeadAxis:
         half = self.config.reading_jitter / 2 * axis.quantum
         leg = Leg(axis.leg.position(now), goal, now, speed, radians(self.config.acceleration_deg))
-        before = self._error(axis, now)
-        after = float(self._rng.uniform(-half, half)) if half else 0.0
-        return replace(axis, leg=leg, load=axis.load_at(now), error=(before, after))
+        error = float(self._rng.uniform(-half, half)) if half else 0.0
+        return axis.started(leg, error, radians(self._faults.zero_loss_deg))
 
-    def _true(self, axis: _Axis, now: float) -> float:
-        return axis.load_at(now) + self._error(axis, now) + self._ring(axis, now)
+    def _zoom_leg(self, goal: float, share: float, now: float) -> Leg:
+        speed = self.config.zoom_units_per_s * max(share, 0.01)
+        return Leg(self._zoom.position(now), goal, now + self.config.zoom_delay_s, speed)
 
-    @staticmethod
-    def _error(axis: _Axis, now: float) -> float:
-        before, after = axis.error
-        if not axis.leg.distance:
-            return after
-        return before + (after - before) * axis.leg.progress(now)
+    def _true(self, axis: HeadAxis, now: float) -> float:
+        lead = axis.sense * self._faults.backlash_first_step * axis.quantum / 2
+        return axis.load_at(now) + axis.error_at(now) + self._ring(axis, now) + lead
 
-    def _ring_time(self, axis: _Axis) -> float:
-        return self.config.ring_time_s if axis.leg.distance and self.config.ring_deg else 0.0
+    def _ring_time(self, axis: HeadAxis) -> float:
+        swings = self.config.ring_deg or self._faults.overshoot_deg
+        return self.config.ring_time_s if axis.leg.distance and swings else 0.0
 
-    def _ring(self, axis: _Axis, now: float) -> float:
+    def _ring(self, axis: HeadAxis, now: float) -> float:
         """A swing that begins in the direction of travel and is cut off when it has died down."""
         t, total = now - axis.leg.end, self._ring_time(axis)
         if not 0 < t < total:
             return 0.0
         size = min(radians(self.config.ring_deg), RING_SHARE * axis.leg.distance)
+        size += min(radians(self._faults.overshoot_deg), axis.leg.distance / 2)
         swing = exp(-10 * t / total) * sin(2 * pi * RING_PERIODS * t / total)
         return copysign(size, axis.leg.goal - axis.leg.start) * swing
-
-    @staticmethod
-    def _halt(axis: _Axis, now: float) -> float:
-        """The next stop ahead of a moving axis, or where a standing one stands."""
-        position = axis.leg.position(now)
-        if now >= axis.leg.end:
-            return position
-        ahead = copysign(axis.quantum / 2, axis.leg.goal - position)
-        return axis.snapped(position + ahead)
 
 
 def _standing(position: float, now: float) -> Leg:

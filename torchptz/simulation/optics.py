@@ -18,6 +18,7 @@ OPTICAL_UNITS = 16384  # the zoom motor's end
 DIGITAL_UNITS = 31424  # the end of the digital range
 DIGITAL_FACTOR = 12.0  # crop at that end
 CURVE_EXPONENT = 2.5
+NOMINAL_WIDTH = 736  # px; decentrings are drawn for pictures of this width
 NOMINAL_F_PER_WIDTH = 738.0 / 736.0  # a 53 degree wide end
 
 
@@ -103,6 +104,8 @@ class Optics:
     coefficients_wide: tuple[float, float, float]  # a, b, c at the widest zoom
     coefficients_tele: tuple[float, float, float]  # a, b, c at the longest zoom
     blend_rate: float  # how early in log magnification barrel gives way to pincushion
+    # from here on the lens stands still, and pictures are cropped to what is claimed
+    crop_from_units: float = float(OPTICAL_UNITS)
 
     @classmethod
     def from_config(
@@ -119,11 +122,15 @@ class Optics:
         """
         rng = np.random.default_rng([seed, 1])
         width, height = image_size
-        f_wide = width * NOMINAL_F_PER_WIDTH * (1 + rng.uniform(-0.02, 0.02))
-        angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(2.0, 6.0)
+        per_width = NOMINAL_F_PER_WIDTH
+        if lens.horizontal_fov_deg is not None:
+            per_width = 0.5 / np.tan(np.radians(lens.horizontal_fov_deg) / 2)
+        f_wide = width * per_width * (1 + rng.uniform(-0.02, 0.02))
+        fineness = max(width / NOMINAL_WIDTH, 1.0)  # finer pixels, more of them off the middle
+        angle, length = rng.uniform(0, 2 * np.pi), rng.uniform(2.0, 6.0) * fineness
         offset = (length * np.cos(angle), length * np.sin(angle))
         barrel, pincushion = rng.uniform(0.05, 0.08), rng.uniform(0.01, 0.02)
-        drift = rng.uniform(3.0, 6.0)
+        drift = rng.uniform(3.0, 6.0) * fineness
         phase = (rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 3.0) * rng.choice([-1.0, 1.0]))
         blend_rate = rng.uniform(3.0, 4.5)
         shares_wide = (rng.uniform(0.45, 0.55), rng.uniform(0.55, 0.65), -rng.uniform(0.05, 0.15))
@@ -174,11 +181,16 @@ class Optics:
         k = 1 - self.max_magnification ** (-1 / CURVE_EXPONENT)
         return (1 - m ** (-1 / CURVE_EXPONENT)) / k * OPTICAL_UNITS
 
+    def crop(self, zoom_units: float) -> tuple[float, float]:
+        """Where the lens stands at a zoom (motor units), and the crop factor that does the rest."""
+        lens = min(float(zoom_units), self.crop_from_units)
+        return lens, self.magnification(zoom_units) / self.magnification(lens)
+
     def at(self, zoom_units: float) -> LensState:
         """The lens at a zoom. A digital crop is a similarity about the image centre, so it only
         scales focal length, principal point, distortion centre and radius unit."""
-        crop = digital_factor(zoom_units)
-        m = self.magnification(zoom_units) / crop
+        lens_units, crop = self.crop(zoom_units)
+        m = self.magnification(lens_units)
         s = float(np.log(m) / np.log(self.max_magnification))
         pp = np.add(
             np.multiply(self.principal_point_drift, s),

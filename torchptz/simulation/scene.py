@@ -117,7 +117,7 @@ class World:
 def draw_text(frame: np.ndarray, text: str) -> None:
     """White letters with a dark rim in the lower left corner, where cameras write theirs."""
     ink, cover = _letters(text, frame.shape[0], frame.shape[1])
-    part = frame[-ink.shape[0] :]
+    part = frame[-ink.shape[0] :, : ink.shape[1]]
     part[:] = np.rint(ink + (1 - cover) * part)
 
 
@@ -127,15 +127,14 @@ def _letters(text: str, height: int, width: int) -> tuple[np.ndarray, np.ndarray
 
     Drawn once: OpenCV loads its font anew in every thread, and each request has its own.
     """
-    rows = min(height, 40)
+    font, rows = cv2.FONT_HERSHEY_SIMPLEX, min(height, 40)
+    width = min(width, 16 + cv2.getTextSize(text, font, 0.5, 3)[0][0])
     strips = []
     for ground in (0, 255):
         strip = np.full((rows, width, 3), ground, np.uint8)
         for colour, stroke in ((0, 3), (235, 1)):
             place, colours = (8, rows - 10), (colour,) * 3
-            cv2.putText(
-                strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colours, stroke, cv2.LINE_AA
-            )
+            cv2.putText(strip, text, place, font, 0.5, colours, stroke, cv2.LINE_AA)
         strips.append(strip.astype(np.float32))
     return strips[0], 1 - (strips[1] - strips[0]) / 255
 

@@ -12,12 +12,13 @@ from zlib import crc32
 from .camera import SimulatedCamera
 from .config import CameraConfig
 from .server import Reply, Request
-from .visca import SYNTAX_ERROR, Visca, ViscaError
+from .visca import PAN_UNITS_PER_DEG, SYNTAX_ERROR, TILT_UNITS_PER_DEG, Visca, ViscaError
 
 # the older firmware's path, and the one that took over from 1.10 on
 SET_PATHS = ("/command/visca-ptzf.cgi", "/command/ptzf.cgi")
 INQUIRY_PATH = "/command/visca-inquiry.cgi"
 SETTINGS_PATH = "/command/inquiry.cgi"
+OVERLAY_PATH = "/command/superimpose.cgi"
 PICTURE_PATHS = ("/oneshotimage.jpg", "/oneshotimage")
 HEX_MESSAGE = re.compile(r"(?:[0-9a-f]{2}){3,16}")
 
@@ -27,6 +28,8 @@ class SonyRz30:
 
     server_header = "NetEVI/2.06"
     realm = "Sony Network Camera SNC-RZ30"
+    schemes = ("basic",)
+    report_units_per_deg = (PAN_UNITS_PER_DEG, TILT_UNITS_PER_DEG)
 
     def __init__(self, camera: SimulatedCamera) -> None:
         self.camera = camera
@@ -40,6 +43,8 @@ class SonyRz30:
             return self._visca(request)
         if request.path == SETTINGS_PATH:
             return self._settings(request)
+        if request.path == OVERLAY_PATH:
+            return self._overlay(request)
         return Reply(404, b"404 Not Found")
 
     def _visca(self, request: Request) -> Reply:
@@ -54,6 +59,13 @@ class SonyRz30:
             self.visca.command(message)
         except ViscaError as error:
             return Reply(200, error.reply.encode())
+        return Reply(204)
+
+    def _overlay(self, request: Request) -> Reply:
+        wanted = request.parameters.get("superimpose")
+        if wanted not in ("on", "off"):
+            return Reply(400, b"400 Bad Request")
+        self.camera.overlay = wanted == "on"
         return Reply(204)
 
     def _settings(self, request: Request) -> Reply:
@@ -84,9 +96,10 @@ class SonyRz30:
             width, height = config.image_size
             return {"ImageSize": f"{width},{height}", "ImageCodec": "jpeg"}
         if name == "superimpose":
-            return {"SuperImpose": "on" if config.scene.text else "off"}
+            return {"SuperImpose": "on" if self.camera.overlay else "off"}
         if name == "ptzf":  # the key that later models of the make use for it
-            pan, tilt = self.visca.raw_position()
-            values = (pan, tilt, self.visca.raw_zoom(), self.visca.focus)
+            if self.camera.reading() is None:
+                return {}
+            values = (*self.visca.raw_position(), self.visca.raw_zoom(), self.visca.raw_focus())
             return {"AbsolutePTZF": ",".join(f"{v & 0xFFFF:04x}" for v in values)}
         return None

@@ -5,11 +5,12 @@ from __future__ import annotations
 from math import radians
 
 from .camera import SimulatedCamera
-from .head import TILT_ORIGIN
-from .optics import OPTICAL_UNITS
+from .optics import DIGITAL_UNITS, OPTICAL_UNITS
+from .view import HeadPose
 
 PAN_UNITS_PER_DEG = 2448 / 170  # 14.4; raw pan grows to the right
 TILT_UNITS_PER_DEG = 1800 / 115  # 15.652; raw tilt grows downward, -828 is 25 degrees up
+TILT_ORIGIN = radians(828 / TILT_UNITS_PER_DEG - 25)  # raw 0, 27.9 degrees down
 DIGITAL_STEP = 64  # zoom units per step of the digital zoom's own position
 # deg/s of speed codes 01..18 hex (EVI-D100 family); tilt ends at 14 hex
 SPEEDS = (2.0, 2.4, 3.0, 3.7, 4.7, 6.1, 7.4, 9.1, 11, 14, 18, 22, 27, 34, 42, 52, 65, 81, 100, 125)
@@ -19,6 +20,7 @@ PAN_SPEED_CODES, TILT_SPEED_CODES = 0x18, 0x14
 SYNTAX_ERROR = "906002ff"
 NOT_EXECUTABLE = "906141ff"
 FOCUS_FAR, FOCUS_NEAR = 0x1000, 0xC000
+FOCUS_NEAREST = 9999  # of the body's own focus units, from 0
 
 
 def to_nibbles(value: int) -> str:
@@ -47,8 +49,6 @@ class Visca:
 
     def __init__(self, camera: SimulatedCamera) -> None:
         self.camera = camera
-        self.manual_focus = False
-        self.focus = FOCUS_FAR
 
     def inquire(self, message: str) -> str:
         """Answer to an inquiry, e.g. `9050` + pan and tilt nibbles + `ff`."""
@@ -63,9 +63,11 @@ class Visca:
         if message == "81090406ff":
             return "905002ff" if self.camera.digital_zoom else "905003ff"
         if message == "81090438ff":
-            return "905003ff" if self.manual_focus else "905002ff"
+            return "905002ff" if self.camera.focus.auto else "905003ff"
+        if message == "81090434ff":
+            return "905002ff" if self.camera.stabiliser else "905003ff"
         if message == "81090448ff":
-            return f"9050{to_nibbles(self.focus)}ff"
+            return f"9050{to_nibbles(self.raw_focus())}ff"
         raise ViscaError(SYNTAX_ERROR)
 
     def command(self, message: str) -> None:
@@ -84,12 +86,22 @@ class Visca:
             raise ViscaError(SYNTAX_ERROR) from error
 
     def raw_position(self) -> tuple[int, int]:
-        pose = self.camera.head.reading()
+        pose = self._reading()
         pan = -round(pose.pan * PAN_UNITS_PER_DEG / radians(1))
         return pan, round((pose.tilt - TILT_ORIGIN) * TILT_UNITS_PER_DEG / radians(1))
 
     def raw_zoom(self) -> int:
-        return round(self.camera.head.reading().zoom_units)
+        return round(self._reading().zoom_units)
+
+    def raw_focus(self) -> int:
+        share = self.camera.focus.position / FOCUS_NEAREST
+        return round(FOCUS_FAR + share * (FOCUS_NEAR - FOCUS_FAR))
+
+    def _reading(self) -> HeadPose:
+        reading = self.camera.reading()
+        if reading is None:
+            raise ViscaError(NOT_EXECUTABLE)
+        return reading
 
     def _pan_tilt(self, what: str, rest: str) -> None:
         if what in ("02", "03"):  # absolute, relative
@@ -120,48 +132,54 @@ class Visca:
         if len(way) != 4 or way[:2] not in ways or way[2:] not in ways:
             raise ViscaError(SYNTAX_ERROR)
         pan_way, tilt_way = ways[way[:2]], ways[way[2:]]
-        self.camera.head.stop()
+        self.camera.stop(zoom=False)
         if not (pan_way or tilt_way):
             return
         pan, tilt = self.raw_position()
         self._go(pan + 9999 * pan_way, tilt + 9999 * tilt_way, pan_speed, tilt_speed)
 
     def _lens(self, what: str, rest: str) -> None:
-        head = self.camera.head
+        camera = self.camera
         if what == "47":
-            head.zoom_to(from_nibbles(rest) & 0xFFFF)
+            camera.zoom_to(from_nibbles(rest) & 0xFFFF)
         elif what == "46":
-            if not self.camera.digital_zoom:
+            if not camera.digital_zoom:
                 raise ViscaError(NOT_EXECUTABLE)
             steps = from_nibbles(rest)
             if steps or self.raw_zoom() > OPTICAL_UNITS:  # only moves within the digital range
-                head.zoom_to(OPTICAL_UNITS + DIGITAL_STEP * steps)
+                camera.zoom_to(OPTICAL_UNITS + DIGITAL_STEP * steps)
         elif what == "07":
             self._zoom_drive(rest)
         elif what == "06" and rest in ("02", "03"):
-            self.camera.set_digital_zoom(rest == "02")
+            camera.set_digital_zoom(rest == "02")
+        elif what == "34" and rest in ("02", "03"):
+            camera.stabiliser = rest == "02"
         elif what == "38" and rest in ("02", "03"):
-            self.manual_focus = rest == "03"
+            camera.focus.auto = rest == "02"
         elif what == "18" and rest == "01":
-            self.focus = FOCUS_FAR
+            camera.focus.once()
         elif what == "48":
-            if not self.manual_focus:
+            if camera.focus.auto:
                 raise ViscaError(NOT_EXECUTABLE)
-            self.focus = min(max(from_nibbles(rest) & 0xFFFF, FOCUS_FAR), FOCUS_NEAR)
+            share = ((from_nibbles(rest) & 0xFFFF) - FOCUS_FAR) / (FOCUS_NEAR - FOCUS_FAR)
+            camera.focus.position = round(min(max(share, 0.0), 1.0) * FOCUS_NEAREST)
         else:
             raise ViscaError(SYNTAX_ERROR)
 
     def _zoom_drive(self, rest: str) -> None:
         """00 stop; 02 tele, 03 wide; 2p tele and 3p wide at speed p = 0..7."""
-        head = self.camera.head
         if rest == "00":
-            head.zoom_stop()
+            self.camera.stop(pan_tilt=False)
         elif rest in ("02", "03"):
-            head.zoom_to(head.zoom_limit if rest == "02" else 0.0, 0.5)
+            self._zoom_to_the_end(rest == "02", 0.5)
         elif len(rest) == 2 and rest[0] in "23" and rest[1] in "01234567":
-            head.zoom_to(head.zoom_limit if rest[0] == "2" else 0.0, (int(rest[1]) + 1) / 8)
+            self._zoom_to_the_end(rest[0] == "2", (int(rest[1]) + 1) / 8)
         else:
             raise ViscaError(SYNTAX_ERROR)
+
+    def _zoom_to_the_end(self, tele: bool, share: float) -> None:
+        longest = DIGITAL_UNITS if self.camera.digital_zoom else OPTICAL_UNITS
+        self.camera.zoom_to(longest if tele else 0.0, share)
 
 
 def _speeds(text: str) -> tuple[float, float]:

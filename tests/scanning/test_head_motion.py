@@ -1,0 +1,137 @@
+"""The way to a pose: from below, sent again once, a motion flag heard but not believed."""
+
+import math
+import threading
+from dataclasses import replace
+
+import pytest
+
+from tests.fake_camera import FakeCamera, capabilities
+from torchptz.cameras import MotionError, Pose
+from torchptz.scanning import head_motion
+from torchptz.scanning.head_motion import HeadMotion
+
+OVERSHOOT = math.radians(0.5)
+FINE = {"pan_quantum": 0.0, "tilt_quantum": 0.0}
+
+
+class Time:
+    now = 50.0
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Time()
+    monkeypatch.setattr(head_motion, "time", clock)
+    return clock
+
+
+class Head(FakeCamera):
+    """Moves at once, unless it is deaf to a command; ``flag`` is what it says of its motion."""
+
+    def __init__(self, can=None):
+        super().__init__(None, None, None, 700.0, can or capabilities(**FINE))
+        self.sent, self.deaf, self.flag = [], set(), None
+
+    def move(self, pose):
+        self.sent.append(pose)
+        if len(self.sent) not in self.deaf:
+            super().move(pose)
+
+    def at_rest(self):
+        return self.flag
+
+
+def motion(camera, overshoot=OVERSHOOT):
+    return HeadMotion(camera, threading.Event(), 5.0, 0.05, overshoot)
+
+
+class TestWay:
+    def test_an_axis_that_would_arrive_downwards_goes_beyond_first(self, clock):
+        head = motion(Head())
+        head.go(Pose(0.5, 0.2, 0.0))
+        assert head.way_to(Pose(0.4, 0.3, 0.0)) == Pose(0.4 - OVERSHOOT, 0.3, 0.0)
+        assert head.way_to(Pose(0.6, 0.1, 0.0)) == Pose(0.6, 0.1 - OVERSHOOT, 0.0)
+
+    def test_upwards_it_goes_straight(self, clock):
+        head = motion(Head())
+        head.go(Pose(0.5, 0.2, 0.0))
+        assert head.way_to(Pose(0.6, 0.2, 0.0)) is None
+
+    def test_nobody_knows_from_where_a_head_came_first(self):
+        assert motion(Head()).way_to(Pose(0.5, 0.2, 3.0)) == Pose(
+            0.5 - OVERSHOOT, 0.2 - OVERSHOOT, 3.0
+        )
+
+    def test_at_its_lower_limit_it_stays_within(self, clock):
+        head = motion(Head())
+        head.go(Pose(0.5, 0.2, 0.0))
+        low = head.camera.capabilities.pan_limits[0]
+        assert head.way_to(Pose(low + OVERSHOOT / 2, 0.2, 0.0)).pan == pytest.approx(low)
+
+    def test_on_a_circle_the_short_way_counts(self, clock):
+        circle = capabilities(**FINE, pan_limits=(-math.pi, math.pi), pan_circular=True)
+        head = motion(Head(circle))
+        head.go(Pose(3.1, 0.2, 0.0))
+        assert head.way_to(Pose(-3.1, 0.2, 0.0)) is None  # 0.08 rad upwards over the seam
+        head.go(Pose(-3.1, 0.2, 0.0))
+        assert head.way_to(Pose(3.14, 0.2, 0.0)).pan == pytest.approx(3.14 - OVERSHOOT)
+
+    def test_without_overshoot_there_is_no_way(self):
+        assert motion(Head(), 0.0).way_to(Pose(0.5, 0.2, 0.0)) is None
+
+    def test_less_than_the_grid_of_the_head_is_no_move(self, clock):
+        head = motion(Head(capabilities()))
+        at = head.go(Pose(0.5, 0.2, 0.0))
+        assert head.way_to(replace(at, pan=at.pan - 1e-4)) is None
+
+
+class TestCommands:
+    def test_one_that_was_swallowed_is_sent_again(self, clock):
+        camera = Head()
+        camera.deaf = {2}
+        head = motion(camera)
+        head.go(Pose(0.1, 0.2, 0.0))
+        assert head.go(Pose(0.5, 0.2, 0.0)).pan == pytest.approx(0.5)
+        assert len(camera.sent) == 3
+
+    def test_a_head_that_is_deaf_is_told_twice_and_given_up(self, clock):
+        camera = Head()
+        camera.deaf = {1, 2, 3, 4}
+        with pytest.raises(MotionError, match=r"camera fake: the head does not move"):
+            motion(camera).go(Pose(0.5, 0.2, 0.0))
+        assert len(camera.sent) == 2
+
+
+class TestFlag:
+    def test_a_flag_that_stays_up_is_waited_for_once(self, clock):
+        camera = Head()
+        camera.flag = False
+        head = motion(camera)
+        began = clock.now
+        head.go(Pose(0.5, 0.2, 0.0))
+        first, began = clock.now - began, clock.now
+        reading = head.go(Pose(0.6, 0.2, 0.0))
+        assert 0.9 < first < 1.5
+        assert clock.now - began < 0.3
+        assert "still moves" in head.rest_rule(reading, Pose(0.6, 0.2, 0.0))
+
+    def test_a_flag_that_falls_ends_the_wait(self, clock):
+        camera = Head()
+        falls = clock.now + 0.4
+        camera.at_rest = lambda: clock.now > falls
+        reading = motion(camera).go(Pose(0.5, 0.2, 0.0))
+        assert falls < clock.now < falls + 0.2
+        assert "still" not in motion(camera).rest_rule(reading, Pose(0.5, 0.2, 0.0))
+
+    def test_a_head_that_says_it_rests_is_not_believed(self, clock):
+        camera = Head()
+        camera.flag, camera.deaf = True, {1, 2}
+        with pytest.raises(MotionError, match="does not move"):
+            motion(camera).go(Pose(0.5, 0.2, 0.0))

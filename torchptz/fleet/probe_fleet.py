@@ -1,0 +1,86 @@
+"""Probes many cameras at the same time, one worker each."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+
+from torchptz.cameras import CameraError, open_camera
+from torchptz.fleet.config import CameraConfig
+from torchptz.fleet.probe import Told, probe
+from torchptz.fleet.probe_report import ProbeReport
+from torchptz.scanning.head_motion import Stopped
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[str, str, int, int], None]  # camera, what, done, total
+
+
+def probe_fleet(
+    cameras: Sequence[CameraConfig], out: Path | None = None, progress: Progress = lambda *_: None
+) -> dict[str, ProbeReport]:
+    """Probe cameras at the same time, each with all checks.
+
+    Args:
+        cameras: of a fleet.
+        out: folder; each camera gets its `probe.json` in a folder of its own.
+        progress: called with (camera, what, done, total) from the cameras' threads.
+
+    Returns:
+        Reports by name. What goes wrong with a camera stands in its report, and stops no other.
+
+    Raises:
+        KeyboardInterrupt: after every head was sent back.
+    """
+    stop = threading.Event()
+
+    def one(config: CameraConfig) -> ProbeReport:
+        report = _connected(config, lambda *what: progress(config.name, *what), stop)
+        if out is not None:
+            report.save(out / config.name)
+        progress(config.name, "passed" if report.passed else "refused", 1, 1)
+        return report
+
+    with ThreadPoolExecutor(max_workers=max(len(cameras), 1)) as workers:
+        try:
+            running = {config.name: workers.submit(one, config) for config in cameras}
+            wait(running.values())
+        except BaseException:
+            # Leaving the with block waits for the workers, which put their heads back first.
+            stop.set()
+            raise
+    return {name: future.result() for name, future in running.items()}
+
+
+def _connected(config: CameraConfig, progress: Told, stop: threading.Event) -> ProbeReport:
+    """The full probe of one camera, from connecting to closing."""
+    camera = None
+    try:
+        progress("connecting", 0, 1)
+        camera = open_camera(
+            config.dialect,
+            config.name,
+            config.address,
+            config.resolve_credentials(),
+            **config.driver_options(),
+        )
+        camera.connect()
+        report = probe(camera, config, progress, stop=stop)
+        report.notes[:0] = camera.notes
+        return report
+    except Exception as error:
+        # A defect of ours must cost one camera, not the others' results.
+        text = str(error)
+        if not isinstance(error, CameraError | ValueError | OSError | Stopped):
+            logger.exception("camera %s: unexpected failure", config.name)
+            text = f"unexpected {type(error).__name__}: {text}"
+        name = f"camera {config.name}"
+        return ProbeReport(
+            config.name, refused=text if text.startswith(name) else f"{name}: {text}"
+        )
+    finally:
+        if camera is not None:
+            camera.close()
