@@ -16,6 +16,7 @@ _THERE_QUANTA = 0.6
 # A head that stops beside its target is good enough: its reading says where it is. It is at rest if
 # it stays; until then it may be creeping there, or, where it was not seen to move, not yet off.
 _BESIDE_QUANTA = 5.1
+_USUAL_QUANTA = 2.0
 _BESIDE_S = 0.6
 _NOT_OFF_S = 1.0
 # Two readings closer than this are one: at rest a reading may flicker by a count.
@@ -66,6 +67,7 @@ class HeadMotion:
         self._sent: Pose | None = None
         self._believes_flag = True
         self._flag_stuck = False
+        self._usual_miss = 0.0  # quanta by which the head stops beside its targets
 
     def check_stop(self) -> None:
         """Raises Stopped where the run was asked to stop."""
@@ -119,6 +121,7 @@ class HeadMotion:
                 anchor, changed = reading, now
             elif self._arrived(reading, pose, now - changed, self.same(reading, first)):
                 if not self._waits_for_flag(now - changed):
+                    self._learn_miss(reading, pose)
                     return reading
                 time.sleep(self._poll)
                 continue
@@ -175,7 +178,14 @@ class HeadMotion:
         beside = unchanged_s > (_NOT_OFF_S if as_first else _BESIDE_S)
         quanta, zoom = self._apart(reading, pose)
         zoomed = zoom <= max(_ZOOM_ARRIVAL, self._zoom_quanta(0.6))
-        return zoomed and quanta <= (_BESIDE_QUANTA if beside else _THERE_QUANTA)
+        there = _THERE_QUANTA if as_first else max(_THERE_QUANTA, self._usual_miss)
+        return zoomed and quanta <= (_BESIDE_QUANTA if beside else there)
+
+    def _learn_miss(self, reading: Pose, pose: Pose) -> None:
+        """A head that reads more finely than it stops misses all its targets a little, and is not
+        waited for each time."""
+        quanta, _ = self._apart(reading, pose)
+        self._usual_miss = min(max(self._usual_miss, quanta), _USUAL_QUANTA)
 
     def _zoom_quanta(self, count: float) -> float:
         """Share of the zoom range that so many quanta are."""

@@ -67,8 +67,8 @@ def learn_zoom(
         name: of the camera, for messages.
 
     Returns:
-        ZoomReport. The curve ends where pictures show too little, nothing more is magnified, or a
-        digital part begins; its notes say so.
+        ZoomReport. The curve ends where nothing more is magnified or a digital part begins, and is
+        a guess from where pictures show too little; its notes say so.
 
     Raises:
         MotionError: the camera does not zoom, or the wrong way; the message says the way out.
@@ -117,7 +117,7 @@ def learn_zoom(
     if reached < high:
         notes.append(
             f"beyond {steps[-1].units:g} units of zoom the pictures show too little to tell what "
-            "it magnifies: it is used up to there; point it at something with finer texture"
+            "it magnifies, and it is guessed until the feature tells; finer texture would show it"
         )
     notes += [f"nothing is magnified between {a:g} and {b:g} units of zoom" for a, b in dead]
     digital, told = digital_part([step.detail for step in steps])
@@ -135,6 +135,8 @@ def learn_zoom(
     curve = ZoomCurve(
         tuple(step.units for step in kept), (1.0, *(math.exp(step.log) for step in kept[1:]))
     )
+    if reached < high and digital is None:
+        curve = _continued(curve, guess, max_magnification)
     sigma = math.hypot(math.sqrt(variance), _BENT * (len(kept) - 1))
     if max_magnification and reached >= high and digital is None:
         total = curve.max_magnification
@@ -198,6 +200,20 @@ def _further(guess: ZoomCurve, units: float, log: float) -> float:
     if wanted * math.exp(0.25 * log) >= guess.max_magnification:
         return guess.limits[1]
     return guess.units_of(wanted)
+
+
+def _continued(curve: ZoomCurve, guess: ZoomCurve, most: float | None) -> ZoomCurve:
+    """A curve that goes on as the guess does, to what the device says of its long end."""
+    end, magnified = curve.limits[1], curve.max_magnification
+    rest = [units for units in guess.units if units > end]
+    logs = [math.log(guess.magnification_of(one) / guess.magnification_of(end)) for one in rest]
+    if most is not None and most > magnified:
+        share = math.log(most / magnified) / logs[-1]
+        logs = [share * log for log in logs]
+    return ZoomCurve(
+        (*curve.units, *rest),
+        (*curve.magnifications, *(magnified * math.exp(log) for log in logs)),
+    )
 
 
 def _stretched(curve: ZoomCurve, most: float) -> ZoomCurve:
