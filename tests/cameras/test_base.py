@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from torchptz.cameras import Camera, CameraError, Capabilities, Credentials, Pose
 from torchptz.cameras import base as errors
-from torchptz.cameras.sony import SonyRZ30Camera
+from torchptz.cameras.sony.rz30 import SonyRZ30Camera
 
 
 def capabilities(**changes) -> Capabilities:

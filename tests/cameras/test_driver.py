@@ -7,7 +7,7 @@ import pytest
 from torchptz.cameras import Axis, ConnectionFailed, HeadAxes, MotionError, Pose, ZoomCurve
 from torchptz.cameras.base import CameraError
 from torchptz.cameras.driver import Driver, signed
-from torchptz.cameras.transport import CameraTransport
+from torchptz.cameras.http.transport import CameraTransport
 
 DEGREE = math.radians(1)
 AXES = HeadAxes(

@@ -1,7 +1,7 @@
 import pytest
 
 from torchptz.cameras import AuthenticationError, ConnectionFailed, ProtocolError
-from torchptz.cameras.sony import SonyRZ30Camera
+from torchptz.cameras.sony.rz30 import SonyRZ30Camera
 from torchptz.cameras.switches import switch
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchptz.cameras import Capabilities, MotionError, Pose
-from torchptz.cameras.sony_zoom import curve
+from torchptz.cameras.sony.zoom import curve
 from torchptz.scanning import head_motion, observation
 from torchptz.scanning.approach import FeatureNotFound, approach
 from torchptz.scanning.observation import Observer

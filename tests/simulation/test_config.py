@@ -54,7 +54,7 @@ class TestFaults:
 
     @pytest.mark.parametrize("name", FaultConfig.model_fields)
     def test_no_switch_without_an_effect(self, name):
-        sources = Path(simulation.__file__).parent.glob("*.py")
+        sources = Path(simulation.__file__).parent.rglob("*.py")
         read = [path.name for path in sources if f"aults.{name}" in path.read_text()]
         assert set(read) - {"config.py"}
 

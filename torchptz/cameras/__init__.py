@@ -17,7 +17,7 @@ from .base import (
     Pose,
     ProtocolError,
 )
-from .tls import Tls
+from .http.tls import Tls
 from .zoom_curve import ZoomCurve
 
 __all__ = [
@@ -42,12 +42,12 @@ __all__ = [
 
 # Module and class of each dialect's driver; loaded when a camera speaks it.
 DIALECTS: dict[str, tuple[str, str]] = {
-    "axis": ("axis", "AxisCamera"),
-    "hikvision": ("hikvision", "HikvisionCamera"),
-    "onvif": ("onvif", "OnvifCamera"),
-    "sony_named": ("sony_named", "SonyNamedCamera"),
-    "sony_rz30": ("sony", "SonyRZ30Camera"),
-    "sony_srg": ("sony_named", "SonySRGCamera"),
+    "axis": ("axis.camera", "AxisCamera"),
+    "hikvision": ("hikvision.camera", "HikvisionCamera"),
+    "onvif": ("onvif.camera", "OnvifCamera"),
+    "sony_named": ("sony.named", "SonyNamedCamera"),
+    "sony_rz30": ("sony.rz30", "SonyRZ30Camera"),
+    "sony_srg": ("sony.named", "SonySRGCamera"),
 }
 # What every driver takes; the rest are options of its own.
 COMMON_OPTIONS = ("pan_sign", "tilt_sign", "tls", "connect_timeout_s", "read_timeout_s")

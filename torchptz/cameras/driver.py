@@ -12,7 +12,7 @@ import numpy as np
 
 from .axes import Axis, HeadAxes
 from .base import CameraError, Capabilities, MotionError, Pose
-from .transport import CameraTransport
+from .http.transport import CameraTransport
 from .zoom_curve import ZoomCurve
 
 logger = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core.core_schema import ValidationInfo
 
 from torchptz.cameras import DIALECTS, Credentials, dialect_options, open_camera
-from torchptz.cameras.wire import parse_address
+from torchptz.cameras.http.wire import parse_address
 from torchptz.files import write_whole
 from torchptz.fleet.config_sections import (
     CredentialsConfig,

@@ -15,14 +15,14 @@ from .config import SimulationConfig, SimulationError
 from .server import DeviceServer, Dialect
 from .truth import write_truth
 
-# name -> module of this package and class; imported when a camera speaks it
+# name -> module of the package dialects, and class; imported when a camera speaks it
 DIALECTS = {
     "sony_rz30": ("sony_rz30", "SonyRz30"),
     "sony_named": ("sony_named", "SonyNamed"),
     "sony_srg": ("sony_named", "SonySrg"),
-    "axis": ("axis_vapix", "AxisVapix"),
-    "onvif": ("onvif_device", "OnvifDevice"),
-    "hikvision": ("hikvision_isapi", "HikvisionIsapi"),
+    "axis": ("axis", "AxisVapix"),
+    "onvif": ("onvif", "OnvifDevice"),
+    "hikvision": ("hikvision", "HikvisionIsapi"),
 }
 
 
@@ -32,7 +32,7 @@ def dialect_of(camera: SimulatedCamera) -> Dialect:
     Raises SimulationError for options that the dialect does not have.
     """
     module, name = DIALECTS[camera.config.dialect]
-    make = getattr(import_module(f".{module}", __package__), name)
+    make = getattr(import_module(f".dialects.{module}", __package__), name)
     try:
         dialect = make(camera, **camera.config.dialect_options)
     except (TypeError, ValueError) as error:

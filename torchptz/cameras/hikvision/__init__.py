@@ -1,0 +1,1 @@
+"""Hikvision cameras and their rebrands (ISAPI)."""

@@ -1,0 +1,1 @@
+"""HTTP to a camera: login, encryption, limits, and replies that may be anything."""

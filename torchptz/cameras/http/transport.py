@@ -1,0 +1,285 @@
+"""HTTP to one camera: serial, bounded, repeated where that is safe, silent about credentials.
+
+Old camera firmware breaks rules: it closes or forgets connections, drops lengths, sends half
+pictures with status 200, and locks accounts after a few wrong passwords. All of that is met here,
+so that a driver only knows its dialect.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from ..base import (
+    AuthenticationError,
+    BadPicture,
+    CameraError,
+    ConnectionFailed,
+    Credentials,
+    ProtocolError,
+)
+from .auth import Login, Refusal
+from .exchange import Exchange, Failure, Order, Reply, shown, target_of
+from .picture import MAX_BYTES, DamagedPicture, decode_jpeg
+from .tls import Tls
+from .wire import parse_address
+
+__all__ = ["MAX_TEXT_BYTES", "CameraTransport", "Reply"]
+
+logger = logging.getLogger(__name__)
+
+MAX_TEXT_BYTES = 2**16
+_BUSY = 503  # too many viewers, or a motor command still in progress: passes by itself
+_LONGEST_RETRY_AFTER_S = 2.0
+_LOGIN_PAUSE = 10  # a camera's connections are freed within seconds: times pause_s
+_HINTS = {
+    400: "check that the camera's model is the one that this dialect is for",
+    403: "give the account the right to move the camera, and switch exclusive control off",
+    404: "check that the camera's model is the one that this dialect is for",
+    503: "close other viewers of this camera",
+}
+
+Result = TypeVar("Result")
+
+
+class CameraTransport:
+    """One camera's HTTP connection; requests from several threads wait for each other.
+
+    name: how messages call the camera. address: "host" or "host:port". credentials: for the login
+    that the camera asks for, Basic or Digest. tls: given, the camera is spoken to over HTTPS (port
+    443 if the address has none). Times are in seconds; read_timeout_s bounds each silence and a
+    whole reply. attempts: how often a repeatable request is sent in all, with a pause of pause_s,
+    doubling, in between.
+
+    **The first rejected login ends it**: cameras lock accounts after a handful of wrong passwords,
+    so every later call raises AuthenticationError without traffic. What else a 401 may mean, see
+    `Login`.
+
+    Raises ValueError for an address or credentials that cannot be used, or an unusable CA file.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        credentials: Credentials | None = None,
+        *,
+        tls: Tls | None = None,
+        connect_timeout_s: float = 3.0,
+        read_timeout_s: float = 10.0,
+        attempts: int = 3,
+        pause_s: float = 0.1,
+    ) -> None:
+        self.address = parse_address(name, address, 443 if tls else 80)
+        self.label = f"camera {name} ({self.address})"
+        _check(name, credentials)
+        self._attempts, self._pause_s = attempts, pause_s
+        self._lock = threading.Lock()
+        self._login = Login(credentials, _LOGIN_PAUSE * pause_s)
+        try:
+            self._exchange = Exchange(self.address, tls, (connect_timeout_s, read_timeout_s))
+        except ValueError as error:
+            raise ValueError(f"camera {name}: {error}") from None
+        self._stopped: Refusal | None = None
+        self._closed = False
+        if tls is not None and not tls.verify:
+            logger.warning("%s: its certificate is not checked (verify: false)", self.label)
+
+    def __repr__(self) -> str:
+        return f"CameraTransport({self.label})"
+
+    def get(self, path: str, *, repeatable: bool = True) -> Reply:
+        """GET a path (with its query, already encoded); the reply's status is for the caller.
+
+        Errors and repeatable: as send().
+        """
+        return self.send("GET", path, repeatable=repeatable)
+
+    def send(
+        self,
+        method: str,
+        path: str,
+        body: bytes = b"",
+        content_type: str | None = None,
+        *,
+        repeatable: bool = False,
+        login: bool = True,
+    ) -> Reply:
+        """Send a request of any method; the reply's status is for the caller.
+
+        repeatable: sending the request twice has the effect of sending it once (inquiries,
+        absolute targets, modes); only then is a failed one sent again, unless there was no
+        connection. A 503 counts as failed. login=False: without credentials, and a 401 is a reply
+        like others.
+
+        Raises AuthenticationError, ConnectionFailed, ProtocolError; ValueError for no method.
+        """
+        if not method.isalpha():
+            raise ValueError(f"{method!r} is no method of HTTP")
+        target = self._target(path)
+        order = Order(method, target, MAX_TEXT_BYTES, body, content_type, login)
+        return self._repeat(lambda: self._get_text(order), repeatable)
+
+    def get_picture(self, path: str) -> np.ndarray | Reply:
+        """GET a JPEG, complete and decoded: (H, W, 3) uint8, BGR; a reply of status 404 as it is.
+
+        The bytes count, not what the reply calls them. A damaged one is fetched again. Raises
+        BadPicture and what get() raises.
+        """
+        order = Order("GET", self._target(path), MAX_BYTES)
+        return self._repeat(lambda: self._get_picture(order), True)
+
+    def error(self, kind: type[CameraError], cause: str, way_out: str) -> CameraError:
+        """An exception whose message names the camera, the cause and the way out."""
+        return kind(f"{self.label}: {cause}; {way_out}")
+
+    def status_error(self, reply: Reply, request: str) -> ProtocolError:
+        """The exception for a reply of an unwanted status to a request, described in words."""
+        return self.error(ProtocolError, *_status(reply, request))
+
+    def refuse(self, cause: str, way_out: str) -> AuthenticationError:
+        """What to raise where the device refused the login inside a reply (a SOAP fault): every
+        later call raises it too, without traffic, as after a 401."""
+        with self._lock:
+            self._stopped = Refusal(AuthenticationError, cause, way_out)
+        return self.error(AuthenticationError, cause, way_out)
+
+    def close(self) -> None:
+        """Close the connection, after a request in progress; later requests are refused."""
+        with self._lock:
+            self._closed = True
+            self._exchange.close()
+
+    def _target(self, path: str) -> str:
+        try:
+            return target_of(path)
+        except ValueError as error:
+            cause = f"cannot be asked: {error}"
+        raise self.error(ProtocolError, cause, "see which addresses the camera hands out")
+
+    def _repeat(self, attempt: Callable[[], Result], repeatable: bool) -> Result:
+        with self._lock:
+            for count in range(1, self._attempts + 1):
+                self._refuse_if_stopped()
+                try:
+                    return attempt()
+                except Failure as failed:
+                    kind, cause, way_out = failed.outcome
+                    again = failed.again and (repeatable or failed.nothing_sent)
+                    wait_s = failed.wait_s
+                if not again or count == self._attempts:
+                    break
+                logger.info("%s: %s; trying again", self.label, cause)
+                time.sleep(max(wait_s, self._pause_s * 2 ** (count - 1)))
+        times = f" ({count} times)" if count > 1 else ""
+        raise self.error(kind, cause + times, way_out)
+
+    def _refuse_if_stopped(self) -> None:
+        if self._closed:
+            raise self.error(ConnectionFailed, "is closed", "open the camera again")
+        if self._stopped is not None:
+            stop = self._stopped
+            raise self.error(stop.kind, stop.cause, stop.way_out)
+
+    def _ask(self, order: Order) -> Reply:
+        """The reply to a request, with the login that it takes. Raises Failure; stops for good."""
+        while True:
+            authorization = None
+            if order.login:
+                authorization = self._login.header(order.method, order.target, order.body)
+            sent = authorization is not None
+            reply = self._exchange.send(order, authorization)
+            del authorization  # out of sight of those who report the variables of failing frames
+            if not order.login:
+                return reply
+            if reply.status != 401:
+                self._login.passed(reply.status, sent)
+                return reply
+            step = self._login.refused(reply.headers.get("www-authenticate", ""), sent)
+            if isinstance(step, Refusal):
+                self._stopped = step
+                self._refuse_if_stopped()
+            if step:
+                logger.info("%s: answers 401; trying again in %g s", self.label, step)
+                time.sleep(step)
+
+    def _get_text(self, order: Order) -> Reply:
+        reply = self._ask(order)
+        if reply.status == _BUSY:
+            raise _busy(reply, ProtocolError, "is busy (503)")
+        if not reply.complete:
+            cause = f"closed the connection after {len(reply.body)} bytes of a longer answer"
+            raise Failure(ConnectionFailed, cause, "check its network link", again=True)
+        return reply
+
+    def _get_picture(self, order: Order) -> np.ndarray | Reply:
+        reply = self._ask(order)
+        if reply.status == 404:
+            return reply
+        if reply.status != 200:
+            cause, way_out = _status(reply, "the request for a picture")
+            if reply.status == _BUSY:
+                raise _busy(reply, ProtocolError, cause)
+            raise Failure(ProtocolError, cause, way_out, again=False)
+        way_out = "check its network link and its picture settings (JPEG, single pictures)"
+        if not reply.complete:
+            cause = f"closed the connection after {len(reply.body)} bytes of a longer picture"
+            raise Failure(BadPicture, cause, way_out, again=True)
+        if text := _as_text(reply.body):
+            # A page may show the headers of the request.
+            quoted = "" if self._login.hides(text) else f" but {text[:60]!r}"
+            raise Failure(BadPicture, f"sent no JPEG{quoted}", way_out, again=True)
+        try:
+            return decode_jpeg(reply.body)
+        except DamagedPicture as damaged:
+            cause = f"sent a bad picture: {damaged}"
+        raise Failure(BadPicture, cause, way_out, again=True)
+
+
+def _check(name: str, credentials: Credentials | None) -> None:
+    if credentials is None:
+        return
+    try:
+        (credentials.user + credentials.password).encode()
+        sound = credentials.user.isprintable()
+    except UnicodeError:
+        sound = False
+    if not sound:
+        raise ValueError(
+            f"camera {name}: an unprintable character in the credentials cannot be sent; choose "
+            "others on the camera"
+        )
+
+
+def _status(reply: Reply, request: str) -> tuple[str, str]:
+    """Cause and way out for a reply of an unwanted status."""
+    cause = f"answered {request} with status {reply.status}"
+    if 300 <= reply.status < 400:
+        try:
+            host = urlsplit(reply.headers.get("location", "")).hostname or ""
+        except ValueError:
+            host = ""
+        host = shown(host, 60)
+        way_out = f"it points to {f'the host {host}' if host else 'another path'}, which is not "
+        return cause, way_out + "followed: check its address, and whether it wants https (tls)"
+    return cause, _HINTS.get(reply.status, "see the camera's own log, or restart it")
+
+
+def _busy(reply: Reply, kind: type[CameraError], cause: str) -> Failure:
+    asked = reply.headers.get("retry-after", "")
+    wait_s = float(asked) if asked.isdecimal() else 0.0
+    wait_s = min(wait_s, _LONGEST_RETRY_AFTER_S)
+    return Failure(kind, cause, _HINTS[_BUSY], again=True, wait_s=wait_s)
+
+
+def _as_text(body: bytes) -> str:
+    """The start of a body that is text, printable and on one line; "" for a picture's bytes."""
+    head = body[:2000]
+    printable = sum(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head)
+    if printable < 0.9 * len(head):
+        return ""
+    return " ".join("".join(chr(b) if 32 <= b < 127 else " " for b in head).split())

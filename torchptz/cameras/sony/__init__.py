@@ -1,0 +1,1 @@
+"""Sony SNC, SRG and BRC cameras."""

@@ -1,0 +1,330 @@
+"""Sony network cameras that take named parameters: ``ptzf.cgi?AbsolutePanTilt=p,t,speed``.
+
+Two generations speak it. SNC-RZ25, RZ50, RX and later SNC models count in 16 bits, with units that
+differ by model; SRG and BRC models count in 20 bits, 512 units per degree, and tell whether they
+move. Both write hexadecimal two's complement, and both tell their ranges in the answer to
+``inquiry.cgi?inq=ptzf``.
+
+Until pictures or the configuration tell otherwise, raw pan is taken to grow to the right and raw
+tilt upward, as the signed speeds of this make do; a hanging camera turns both round.
+"""
+
+import math
+import time
+from functools import partial
+
+import numpy as np
+
+from ..axes import Axis, HeadAxes
+from ..base import Credentials, Pose, ProtocolError
+from ..driver import Driver, signed
+from ..http.tls import Tls
+from ..http.transport import CameraTransport
+from ..switches import switch
+from . import zoom as sony_zoom
+from .ptzf import POSITION, Format, Ptzf
+from .settings import SonyPictures, SonySettings, identity_in, switch_overlays_off
+
+_MAX_SPEED = 24
+_FOCUS_POLL_S, _FOCUS_SPEED = 0.2, 8
+
+
+class _NamedCamera(Driver):
+    """What both generations share; nothing is sent before the first call."""
+
+    _format: Format
+    _other: str  # who counts otherwise, for messages
+    _zero_sigma: float  # rad, how far raw 0 may be from straight ahead and level
+
+    def __init__(
+        self,
+        name: str,
+        transport: CameraTransport,
+        signs: tuple[int | None, int | None],
+        *,
+        degrees_per_unit: float,
+        scale_sigma: float,
+        ranges_deg: tuple[tuple[float, float], tuple[float, float]],
+        max_magnification: float | None,
+        default_magnification: float,
+        horizontal_fov_deg: float | None,
+        speed: int,
+        focus_wait_s: float,
+    ) -> None:
+        for option, value, good in (
+            ("degrees_per_unit", degrees_per_unit, degrees_per_unit > 0),
+            ("scale_sigma", scale_sigma, scale_sigma >= 0),
+            ("pan_range_deg", ranges_deg[0], ranges_deg[0][0] < ranges_deg[0][1]),
+            ("tilt_range_deg", ranges_deg[1], ranges_deg[1][0] < ranges_deg[1][1]),
+            ("max_magnification", max_magnification, (max_magnification or 2) > 1),
+            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
+            ("speed", speed, isinstance(speed, int) and 1 <= speed <= _MAX_SPEED),
+        ):
+            if not good:
+                raise ValueError(f"camera {name}: {option} cannot be {value!r}")
+        super().__init__(name, transport)
+        self._signs, self._ranges_deg = signs, ranges_deg
+        self._scale, self._scale_sigma = math.radians(degrees_per_unit), scale_sigma
+        self._magnification = max_magnification or default_magnification
+        self._magnification_known = max_magnification is not None
+        if horizontal_fov_deg is not None:
+            self.horizontal_fov = math.radians(horizontal_fov_deg)
+        self._speed, self._focus_wait_s = speed, focus_wait_s
+        self._settings = SonySettings(transport)
+        self._pictures = SonyPictures(transport)
+        self._asked: str | None = None  # pan, tilt, zoom of the last move, as written
+        self._can_focus = True  # until the firmware refuses the switch
+
+    # ---- identity and limits
+
+    def connect(self) -> None:
+        """Ask for position, ranges and identity."""
+        told = self._ask()
+        pan = self._axis("pan", told.pan_range, self._ranges_deg[0])
+        tilt = self._axis("tilt", told.tilt_range, self._ranges_deg[1])
+        self.axes = signed(HeadAxes(pan, tilt), *self._signs)
+        self.zoom_curve = sony_zoom.curve(
+            self._magnification,
+            told.optical_zoom or sony_zoom.OPTICAL_LIMITS,
+            known=self._magnification_known,
+        )
+        self.reports_motion = told.tells_motion
+        system = self._settings.ask_if_known("system")
+        if "RZ30" in system.get("ModelName", "").upper():
+            cause = "is an SNC-RZ30, whose units are others"
+            raise self._transport.error(ProtocolError, cause, "give it the dialect sony_rz30")
+        self.identity = identity_in(system)
+
+    def _axis(
+        self, axis: str, told: tuple[int, int] | None, believed_deg: tuple[float, float]
+    ) -> Axis:
+        limits = told or tuple(round(math.radians(angle) / self._scale) for angle in believed_deg)
+        if told is None:
+            self.notes.append(
+                f"does not tell its range of {axis}: it is taken to be {limits[0]} to {limits[1]} "
+                f"units, see {axis}_range_deg"
+            )
+        return Axis(
+            scale=-self._scale,
+            offset=0.0,
+            limits=limits,
+            quantum=1,
+            scale_sigma=self._scale_sigma,
+            offset_sigma=self._zero_sigma,
+        )
+
+    def _ask(self) -> Ptzf:
+        told = self._settings.ask("ptzf")
+        try:
+            return Ptzf.read(told, self._format)
+        except KeyError:
+            cause = f"answered the inquiry of its position without {POSITION}"
+            way_out = "check that its model pans and tilts, and its dialect (SNC-RZ30: sony_rz30)"
+        except ValueError as error:
+            cause = f"answered the inquiry of its position with something unreadable ({error})"
+            way_out = f"check its dialect: {self._other}"
+        raise self._transport.error(ProtocolError, cause, way_out)
+
+    # ---- motion
+
+    def move(self, pose: Pose) -> None:
+        """Send head and lens to the reachable pose nearest to this one, in one request.
+
+        Raises MotionError, before anything is sent, for a pose beyond the limits.
+        """
+        pan, tilt, zoom = (round(units) for units in self.device_units(pose))
+        pan, tilt = self._format.written(pan), self._format.written(tilt)
+        self._settings.send(
+            f"/command/ptzf.cgi?AbsolutePanTilt={pan},{tilt},{self._speed}&AbsoluteZoom={zoom:04x}"
+        )
+        self._asked = f"{pan},{tilt},{zoom:04x}"
+
+    def position(self) -> Pose:
+        """Where the camera reads its head and lens; zoom in device units."""
+        told = self._ask()
+        self.reported_moving = told.moving
+        return self.pose_of(told.pan, told.tilt, told.zoom)
+
+    # ---- pictures
+
+    def snapshot(self) -> np.ndarray:
+        """One complete picture: (H, W, 3) uint8, BGR. Raises BadPicture after a few attempts."""
+        return self._pictures.get()
+
+    def focus_once(self) -> float | None:
+        """Focus on what the head points at now, then keep that focus; blocks for focus_wait_s
+        at most. Returns the focus; does nothing on firmware that refuses to lock the focus.
+        """
+        if not self._can_focus:
+            return None
+        # The trigger works in manual mode; a repeat would start a second search.
+        self._settings.set("ptzf", "FocusMode", "manual")
+        self._settings.send(f"/command/ptzf.cgi?Move=onepushaf,{_FOCUS_SPEED}", repeatable=False)
+        focus = self._wait_for_focus()
+        self._settings.set("ptzf", "FocusMode", "manual")
+        return focus
+
+    def set_focus(self, focus: float) -> None:
+        """Go to a focus that focus_once() returned, and stay there."""
+        self._settings.set("ptzf", "FocusMode", "manual")
+        self._send_focus(f"{round(focus):04x}")
+
+    def _wait_for_focus(self) -> float:
+        """The focus once it stands still, or at the end of the time."""
+        deadline = time.monotonic() + self._focus_wait_s
+        now = None
+        while (left := deadline - time.monotonic()) > 0 or now is None:
+            time.sleep(max(min(_FOCUS_POLL_S, left), 0))
+            told = self._ask()
+            before, now = now, told.focus
+            if now == before and not told.focus_moving:
+                break
+        return float(now)
+
+    def _send_focus(self, focus: str) -> None:
+        """Only a whole pose has a focus: the last one asked for, else the one that is read."""
+        if self._asked is None:
+            self._asked = self._ask().text.rpartition(",")[0]
+        self._settings.set("ptzf", POSITION, f"{self._asked},{focus}")
+
+    # ---- state
+
+    def prepare(self) -> None:
+        """Lock the focus, and switch overlays and stabiliser off where the firmware has switches.
+
+        Digital zoom needs none: it lies beyond the optical end, where move() never goes.
+        """
+        told = self._ask()
+        lock = partial(self._settings.set, "ptzf", "FocusMode", "manual")
+        undo = partial(self._restore_focus, told)
+        self._can_focus = switch(self, "focus", lock, undo, "set it to manual in its settings")
+        for group in ("imaging", "camera"):
+            self._switch_stabiliser_off(group)
+        switch_overlays_off(self, self._settings)
+
+    def _restore_focus(self, before: Ptzf) -> None:
+        if before.focus_mode == "manual":
+            self._send_focus(before.text.rpartition(",")[2])
+        else:
+            self._settings.set("ptzf", "FocusMode", "auto")
+
+    def _switch_stabiliser_off(self, group: str) -> None:
+        mode = self._settings.ask_if_known(group).get("Stabilizer", "off")
+        if mode != "off":
+            change = partial(self._settings.set, group, "Stabilizer")
+            off, undo = partial(change, "off"), partial(change, mode)
+            switch(self, "image stabiliser", off, undo, "switch it off in its settings")
+
+
+class SonyNamedCamera(_NamedCamera):
+    """Driver of SNC-RZ25, RZ50, RX530/550/570 and later SNC models with a head (16 bits).
+
+    address: "host" or "host:port". pan_sign, tilt_sign: -1 turns an axis round against the
+    module's default, 1 confirms it, None leaves it to the pictures. degrees_per_unit differs by
+    model, scale_sigma says how well it is known (0: exactly). pan_range_deg, tilt_range_deg: raw
+    ranges, of use where the firmware does not tell them. max_magnification: at the optical end;
+    None begins with the RZ25's 18 and leaves the curve to the pictures. horizontal_fov_deg: at
+    the widest zoom, from the data sheet. speed: 1..24, the device's steps. focus_wait_s: the
+    longest time that focus_once() allows the autofocus. tls, connect_timeout_s, read_timeout_s:
+    see CameraTransport.
+
+    Raises ValueError for options out of range; its methods raise CameraError subclasses.
+    """
+
+    _format = Format(16)
+    _zero_sigma = math.radians(2)
+    _other = "SRG and BRC models count in 20 bits, with dialect sony_srg"
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        credentials: Credentials | None = None,
+        *,
+        pan_sign: int | None = None,
+        tilt_sign: int | None = None,
+        tls: Tls | None = None,
+        connect_timeout_s: float = 3.0,
+        read_timeout_s: float = 10.0,
+        degrees_per_unit: float = 0.022,
+        scale_sigma: float = 0.01,
+        pan_range_deg: tuple[float, float] = (-170.0, 170.0),
+        tilt_range_deg: tuple[float, float] = (-90.0, 25.0),
+        max_magnification: float | None = None,
+        horizontal_fov_deg: float | None = None,
+        speed: int = _MAX_SPEED,
+        focus_wait_s: float = 3.0,
+    ) -> None:
+        transport = CameraTransport(
+            name,
+            address,
+            credentials,
+            tls=tls,
+            connect_timeout_s=connect_timeout_s,
+            read_timeout_s=read_timeout_s,
+        )
+        super().__init__(
+            name,
+            transport,
+            (pan_sign, tilt_sign),
+            degrees_per_unit=degrees_per_unit,
+            scale_sigma=scale_sigma,
+            ranges_deg=(tuple(pan_range_deg), tuple(tilt_range_deg)),
+            max_magnification=max_magnification,
+            default_magnification=sony_zoom.PUBLISHED_MAGNIFICATION,
+            horizontal_fov_deg=horizontal_fov_deg,
+            speed=speed,
+            focus_wait_s=focus_wait_s,
+        )
+
+
+class SonySRGCamera(_NamedCamera):
+    """Driver of SRG and BRC models (20 bits, 512 units per degree).
+
+    Options as those of SonyNamedCamera; units and ranges the device's own. max_magnification:
+    None begins with 20 and leaves the curve to the pictures.
+
+    Raises ValueError for options out of range; its methods raise CameraError subclasses.
+    """
+
+    _format = Format(20)
+    _zero_sigma = 0.0
+    _other = "SNC models count in 16 bits, with dialect sony_named"
+
+    def __init__(
+        self,
+        name: str,
+        address: str,
+        credentials: Credentials | None = None,
+        *,
+        pan_sign: int | None = None,
+        tilt_sign: int | None = None,
+        tls: Tls | None = None,
+        connect_timeout_s: float = 3.0,
+        read_timeout_s: float = 10.0,
+        max_magnification: float | None = None,
+        horizontal_fov_deg: float | None = None,
+        speed: int = _MAX_SPEED,
+        focus_wait_s: float = 3.0,
+    ) -> None:
+        transport = CameraTransport(
+            name,
+            address,
+            credentials,
+            tls=tls,
+            connect_timeout_s=connect_timeout_s,
+            read_timeout_s=read_timeout_s,
+        )
+        super().__init__(
+            name,
+            transport,
+            (pan_sign, tilt_sign),
+            degrees_per_unit=1 / 512,
+            scale_sigma=0.0,
+            ranges_deg=((-170.0, 170.0), (-30.0, 90.0)),
+            max_magnification=max_magnification,
+            default_magnification=20.0,
+            horizontal_fov_deg=horizontal_fov_deg,
+            speed=speed,
+            focus_wait_s=focus_wait_s,
+        )

@@ -1,0 +1,1 @@
+"""What the simulated cameras say on the wire, one dialect a module."""
