@@ -13,7 +13,7 @@ from torchptz.calibration import parameters as at
 from torchptz.calibration.marginal import Noise
 from torchptz.calibration.priors import Priors, known_of
 from torchptz.calibration.problem import Problem
-from torchptz.calibration.refinement import held_out, inliers, inverse, refine
+from torchptz.calibration.refinement import _returns, held_out, inliers, inverse, refine
 
 PRIORS = Priors(distance_m=12.0, pupil_sigma_m=0.001, focal_length=torch.tensor([[738.0, 3690.0]]))
 NO_PLAY = replace(PRIORS, backlash_sigma=0.0)
@@ -298,3 +298,11 @@ class TestAlgebra:
             own = free[c].nonzero()[:, 0]
             part = torch.linalg.inv(matrix[c][own][:, own])
             torch.testing.assert_close(found[c][own][:, own], part, rtol=1e-6, atol=0)
+
+
+def test_a_step_that_leads_back_is_told_by_the_metric():
+    """Per camera: back, onwards, the first of all, and aside where it counts most."""
+    metric = torch.diag_embed(torch.tensor([1.0, 100.0, 1e-4], dtype=torch.float64)).expand(4, 3, 3)
+    last = torch.tensor([[1, 0, 5], [1, 0, 0], [0, 0, 0], [1, 1, 0]], dtype=torch.float64)
+    step = torch.tensor([[-0.9, 0, 5], [0.9, 0, 0], [1, 1, 1], [-1, 1, 0]], dtype=torch.float64)
+    assert _returns(metric, last, step).tolist() == [True, False, False, False]

@@ -109,6 +109,36 @@ class TestCommands:
         assert len(camera.sent) == 2
 
 
+class Rough(Head):
+    """Reads more finely than it stops: half of a step beside every target."""
+
+    step = math.radians(0.02)
+
+    def move(self, pose):
+        whole = (math.floor(pose.pan / self.step) + 0.5) * self.step
+        super().move(replace(pose, pan=whole))
+
+
+class TestBeside:
+    def test_a_head_that_always_stops_beside_is_waited_for_once(self, clock):
+        head, waited = motion(Rough(), 0.0), []
+        for turn in (10, 20, 30):
+            began = clock.now
+            head.go(Pose(turn * Rough.step, 0.2, 0.0))
+            waited.append(clock.now - began)
+        assert waited[0] > 0.5
+        assert max(waited[1:]) < 0.2
+
+    def test_far_beside_is_never_taken_for_usual(self, clock):
+        camera = Rough()
+        camera.step = math.radians(0.05)  # half of it are more than 4 quanta
+        head = motion(camera, 0.0)
+        head.go(Pose(10 * camera.step, 0.2, 0.0))
+        began = clock.now
+        head.go(Pose(20 * camera.step, 0.2, 0.0))
+        assert clock.now - began > 0.5
+
+
 class TestFlag:
     def test_a_flag_that_stays_up_is_waited_for_once(self, clock):
         camera = Head()

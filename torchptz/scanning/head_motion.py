@@ -65,6 +65,7 @@ class HeadMotion:
         self._poll = poll_interval_s
         self._overshoot = overshoot
         self._sent: Pose | None = None
+        self._stood: Pose | None = None
         self._believes_flag = True
         self._flag_stuck = False
         self._usual_miss = 0.0  # quanta by which the head stops beside its targets
@@ -110,7 +111,8 @@ class HeadMotion:
         sends = 1
         # Time counts from here: a camera that is slow to reply has not begun to move before.
         started = changed = time.monotonic()
-        first = anchor = None  # anchor: the reading that later ones are the same as
+        first = self._stood  # where it was read before the command, if it was
+        anchor = None  # the reading that later ones are the same as
         while True:
             self.check_stop()
             reading = self.camera.position()
@@ -122,6 +124,7 @@ class HeadMotion:
             elif self._arrived(reading, pose, now - changed, self.same(reading, first)):
                 if not self._waits_for_flag(now - changed):
                     self._learn_miss(reading, pose)
+                    self._stood = reading
                     return reading
                 time.sleep(self._poll)
                 continue
@@ -173,12 +176,12 @@ class HeadMotion:
     def _arrived(self, reading: Pose, pose: Pose, unchanged_s: float, as_first: bool) -> bool:
         """Whether a reading is near enough to a pose, after it did not change for a time.
 
-        as_first: it still is the one right after the command.
+        as_first: it still is the one from before the command, or right after the first one.
         """
         beside = unchanged_s > (_NOT_OFF_S if as_first else _BESIDE_S)
         quanta, zoom = self._apart(reading, pose)
         zoomed = zoom <= max(_ZOOM_ARRIVAL, self._zoom_quanta(0.6))
-        there = _THERE_QUANTA if as_first else max(_THERE_QUANTA, self._usual_miss)
+        there = _THERE_QUANTA if as_first else max(_THERE_QUANTA, 1.1 * self._usual_miss)
         return zoomed and quanta <= (_BESIDE_QUANTA if beside else there)
 
     def _learn_miss(self, reading: Pose, pose: Pose) -> None:

@@ -1,0 +1,90 @@
+"""The section of faults: that every switch has its run, and what is called right and wrong."""
+
+import math
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+
+from demo_check import FleetFigures, LensFigures, Standardised
+from faults import runs
+from faults.catalogue import CASES, Case
+
+from torchptz.fleet.summary import CameraResult, ZoomResult
+from torchptz.simulation.faults import FaultConfig
+
+ZOOM = ZoomResult(1.0, 1.0, 0.0, True, "OK")
+
+
+class TestCatalogue:
+    def test_every_switch_has_a_run(self):
+        assert {name for case in CASES for name in case.faults} == {*FaultConfig.model_fields}
+
+    def test_there_are_more_than_25_switches(self):
+        assert len(FaultConfig.model_fields) >= 25
+
+    @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.title}-{case.dialect}")
+    def test_every_case_is_one_that_the_simulator_takes(self, case):
+        FaultConfig.model_validate(case.faults)
+        assert case.table or case.refusals != Case({}).refusals
+
+    def test_titles_tell_the_cases_apart(self):
+        titles = [(case.title, case.dialect) for case in CASES]
+        assert len(set(titles)) == len(titles)
+
+
+class TestVerdicts:
+    """A fleet of one camera, whose errors are made up."""
+
+    @pytest.fixture
+    def judge(self, monkeypatch, tmp_path):
+        def judge(case, result, sigmas=1.0, rejected=0):
+            errors = {"displacement": Standardised(sigmas, sigmas, 1)}
+            lens = LensFigures("one", 1.0, "OK", True, standardised=errors)
+            figures = FleetFigures([lens] if result and result.table else [], [])
+            monkeypatch.setattr(runs, "fleet_figures", lambda *_: figures)
+            return runs._judged(case, result, tmp_path, "one", {}, 3.0, rejected)
+
+        return judge
+
+    def test_a_true_table(self, judge):
+        outcome = judge(Case({}), CameraResult((ZOOM,), "table.json", None))
+        assert (outcome.verdict, outcome.right) == ("table", True)
+
+    @pytest.mark.parametrize("sigmas", [4.1, math.inf])
+    def test_a_table_that_is_not_as_true_as_it_says(self, judge, sigmas):
+        outcome = judge(Case({}), CameraResult((ZOOM,), "table.json", None), sigmas)
+        assert (outcome.verdict, outcome.right) == ("WRONG TABLE", False)
+
+    def test_even_beside_an_error_a_table_must_be_true(self, judge):
+        result = CameraResult((ZOOM,), "table.json", "camera one: cannot be reached")
+        assert judge(Case({}, refusals="reached"), result, 9.0).verdict == "WRONG TABLE"
+        assert judge(Case({}, refusals="reached"), result, 1.0).verdict == "refused"
+
+    def test_a_table_where_none_may_be(self, judge):
+        case = Case({"head_stuck": True}, table=False)
+        outcome = judge(case, CameraResult((ZOOM,), "table.json", None))
+        assert not outcome.right
+
+    def test_a_refusal_for_another_reason(self, judge):
+        result = CameraResult((), None, "camera one: unexpected KeyError: 'pan'")
+        outcome = judge(Case({}, refusals="reached"), result)
+        assert (outcome.verdict, outcome.right) == ("WRONG REASON", False)
+
+    def test_a_zoom_that_failed_must_have_the_reason(self, judge):
+        zoom = replace(ZOOM, ok=False, status="OUTLIERS")
+        result = CameraResult((zoom,), None, None)
+        assert judge(Case({}, refusals="OUTLIERS"), result).verdict == "refused"
+        assert judge(Case({}, refusals="reached"), result).verdict == "WRONG REASON"
+
+    def test_what_never_ends(self, judge):
+        assert judge(Case({}), None).verdict == "HANG"
+
+    def test_logins(self, judge):
+        result = CameraResult((), None, "camera one: refuses the credentials")
+        case = Case({}, refusals="credentials", table=False)
+        assert judge(case, result, rejected=1).right
+        assert judge(case, result, rejected=2).verdict == "TOO MANY LOGINS"
+        assert judge(replace(case, dialect="onvif"), result, rejected=2).right
