@@ -223,6 +223,21 @@ class TestReadme:
         assert (code, after) == (1, text)
         assert reason in output
 
+    @pytest.mark.parametrize("command", ["estimate", "rectify", "faults"])
+    def test_the_project_s_own_text_takes_them(self, load, command):
+        text = (SCRIPTS.parent / "README.md").read_text(encoding="utf-8")
+        report = {
+            "command": command,
+            "quick": False,
+            "sections_asked": ["one"],
+            "sections": {"one": {"title": "A section", "error": None, "table": "", "checks": {}}},
+            "environment": load("machine").environment(),
+        }
+        written = load("readme_tables").with_blocks(text, [report])
+        opening = f"<!-- benchmark {command} -->"
+        assert f"{opening}\n\n**A section**" in written
+        assert written.partition(opening)[0] == text.partition(opening)[0]
+
     def test_two_files_of_one_command(self, put, benchmark, tmp_path):
         put({"one": section()})
         twice = 2 * ["--json", str(tmp_path / "report.json")]

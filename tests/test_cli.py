@@ -26,7 +26,7 @@ from torchptz.fleet.summary import CameraResult, HeadResult, Summary, ZoomResult
 from torchptz.rectification import rectify
 from torchptz.zoom_table import ZoomTable
 
-COMMANDS = ["collect", "solve", "calibrate", "rectify", "simulate"]
+COMMANDS = ["probe", "collect", "solve", "calibrate", "rectify", "simulate"]
 LENS = synthetic.lens()
 
 

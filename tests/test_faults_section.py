@@ -7,13 +7,17 @@ from pathlib import Path
 
 import pytest
 
-
-from demo_check import FleetFigures, LensFigures, Standardised
-from faults import runs
-from faults.catalogue import CASES, Case
-
 from torchptz.fleet.summary import CameraResult, ZoomResult
 from torchptz.simulation.faults import FaultConfig
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
+try:  # as a script imports them, from its folder
+    from demo_check import FleetFigures, LensFigures, Standardised
+    from faults import runs
+    from faults.catalogue import CASES, Case
+finally:
+    sys.path.remove(str(SCRIPTS))
 
 ZOOM = ZoomResult(1.0, 1.0, 0.0, True, "OK")
 

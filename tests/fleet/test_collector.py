@@ -8,11 +8,12 @@ import logging
 import math
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from torchptz.cameras import Capabilities, ConnectionFailed, Pose
+from torchptz.cameras import CameraError, Capabilities, ConnectionFailed, Pose
 from torchptz.fleet import collector as module
 from torchptz.fleet import survey
 from torchptz.fleet.collector import Collector
@@ -469,3 +470,42 @@ class TestPuttingBack:
 def test_the_stored_record_is_plain_json(healthy):
     stored = json.loads((healthy.folder / "camera.json").read_text())
     assert stored["zooms"][0]["patterns"] == "patterns/zoom_00.npz"
+
+
+class TestCoarseHeads:
+    """By the step of its head a camera is measured up to a zoom, or not at all."""
+
+    def zooms(self, one, quantum_deg, zooms, fov_deg=60.0):
+        camera = FakeCamera()
+        quantum = math.radians(quantum_deg)
+        camera.capabilities = replace(
+            FakeCamera.capabilities,
+            pan_quantum=quantum,
+            tilt_quantum=quantum,
+            horizontal_fov=math.radians(fov_deg),
+        )
+        camera.restrict = lambda **limits: camera.calls.append(limits)
+        collector = Collector(
+            one.config.model_copy(update={"zooms": zooms}), one.folder, threading.Event()
+        )
+        collector._image_size = (1280, 720)
+        record = CameraRecord(name="gate")
+        return collector._zooms_in_reach(camera, record), record, camera.calls
+
+    def test_a_fine_head_reaches_all_zooms(self, one):
+        zooms, record, limits = self.zooms(one, 0.004, [1.0, 20.0])
+        assert (zooms, record.zooms) == ([1.0, 20.0], [])
+        assert limits[0]["margin"] == pytest.approx(math.radians(2))
+
+    def test_three_decimals_of_half_a_turn_do_not_reach_the_long_end(self, one):
+        """A step of 0.18 degrees is 3.5 px at the wide end; 5 % of 720 px are 36."""
+        zooms, record, limits = self.zooms(one, 0.18, [1.0, 8.0, 20.0])
+        assert zooms == [1.0, 8.0]
+        (refused,) = record.zooms
+        assert refused.nominal_zoom == 20.0
+        assert "steps of 0.18 degrees, about 70 px at 20x: too coarse" in refused.error
+        assert limits[0]["max_magnification"] == pytest.approx(36 / 3.48, rel=0.01)
+
+    def test_one_that_is_too_coarse_for_any_zoom_is_refused(self, one):
+        with pytest.raises(CameraError, match=r"camera gate: .*steps of 2 degrees, 39 px"):
+            self.zooms(one, 2.0, [1.0])

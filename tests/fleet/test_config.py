@@ -1,6 +1,7 @@
 """FleetConfig: what it accepts, what it says about what it does not, and what it never says."""
 
 import math
+import re
 from pathlib import Path
 
 import certifi
@@ -8,8 +9,18 @@ import pytest
 import yaml
 
 from torchptz.calibration import Priors
-from torchptz.cameras import Tls
-from torchptz.fleet.config import ConfigError, FleetConfig, load_config, parse_config
+from torchptz.cameras import DIALECTS, Tls, dialect_options
+from torchptz.fleet.config import (
+    CameraConfig,
+    ConfigError,
+    FeatureConfig,
+    FleetConfig,
+    HeadConfig,
+    ScanConfig,
+    TimingConfig,
+    load_config,
+    parse_config,
+)
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SECRET = "hunter2-Geheim"
@@ -322,9 +333,30 @@ class TestSecrets:
 class TestShippedConfigurations:
     def test_every_fleet_loads(self):
         names = {path.name for path in CONFIGS.glob("*.yaml")} - {"simulated_fleet.yaml"}
-        assert names >= {"fleet.yaml", "sony_rz30.yaml"}
+        assert names == {"fleet.yaml", *(f"{dialect}.yaml" for dialect in DIALECTS)}
         for name in names:
             assert load_config(CONFIGS / name).cameras
+
+    @pytest.mark.parametrize("dialect", DIALECTS)
+    def test_an_example_shows_every_option_of_its_driver(self, dialect):
+        """Options that are commented out count, and what they show must load."""
+        text = (CONFIGS / f"{dialect}.yaml").read_text(encoding="utf-8")
+        before, cameras, settings = text.partition("\ncameras:\n")
+        settings = re.sub(r"(?m)^( *)# ( *\w+: )", r"\1\2", settings)
+        settings = settings.replace("…", "ab" * 32)  # the fingerprint, which nobody can give here
+        (one,) = parse_config(yaml.safe_load(before + cameras + settings)).cameras
+        assert one.dialect == dialect
+        assert sorted(one.device) == sorted(dialect_options(dialect))
+
+    def test_the_example_that_explains_all_settings_has_them_all(self):
+        data = yaml.safe_load((CONFIGS / "sony_rz30.yaml").read_text(encoding="utf-8"))
+        shown = {**data["defaults"], **data["cameras"][0]}
+        assert shown.keys() == CameraConfig.model_fields.keys()
+        for section, model in (
+            *(("scan", ScanConfig), ("timing", TimingConfig), ("head", HeadConfig)),
+            ("feature", FeatureConfig),
+        ):
+            assert shown[section].keys() == model.model_fields.keys()
 
     def test_the_simulated_cameras_are_those_of_the_simulation(self):
         simulated = yaml.safe_load((CONFIGS / "simulated_fleet.yaml").read_text())["cameras"]

@@ -79,6 +79,13 @@ class TestLooks:
         expected = [(one.commanded.pan, one.commanded.tilt) for one in SCAN]
         np.testing.assert_allclose(found["commanded"], expected)
 
+    def test_visits_of_the_reference_pose_check_and_do_not_count(self, tmp_path):
+        looks = [*SCAN, look("way", 6, LONG, found=False), look("reference", 1, LONGEST)]
+        found = observed(written(tmp_path / "gate", *looks), record_of())
+        assert np.isnan(found["pixel"][-2:]).all()
+        # both moved the head, and from where it came may matter to the next look
+        assert len(found["commanded"]) == len(SCAN) + 2
+
     def test_those_at_zooms_that_are_not_wanted_and_of_the_search_show_nothing(self, folder):
         pixel = observed(folder, record_of())["pixel"]
         shown = [True] * len(SCAN)

@@ -65,6 +65,27 @@ class TestValues:
         assert priors.repeatability.tolist() == pytest.approx([math.radians(0.01), 0.0, 0.0])
         assert priors.pixel_aspect.tolist() == [0.985, 1.0, 1.0]
 
+    def test_what_a_device_leaves_open_adds_to_what_the_configuration_says(self, observations):
+        device = {"axis_scale_sigma": [0.01, 0.02], "tilt_zero_sigma_deg": 3.0}
+        opened = KNOWN.model_copy(update=device)
+        priors = priors_of([opened, NEAR, UNKNOWN], observations)
+        assert priors.axis_scale_sigma.tolist() == [[0.01, 0.02], [0.0, 0.0], [0.0, 0.0]]
+        degrees = torch.rad2deg(priors.tilt_zero_sigma).tolist()
+        assert degrees == pytest.approx([math.hypot(0.2, 3.0), 1.0, 1.0])
+
+    def test_a_measured_repeatability_counts_where_it_is_worse(self, observations):
+        measured = KNOWN.model_copy(update={"measured_repeatability_deg": [0.02, 0.03]})
+        better = KNOWN.model_copy(update={"measured_repeatability_deg": [0.001, 0.002]})
+        priors = priors_of([measured, better, UNKNOWN], observations)
+        assert torch.rad2deg(priors.repeatability).tolist() == pytest.approx([0.03, 0.01, 0.0])
+
+    def test_play_that_shows_nowhere_is_held_and_may_shift_the_tilt(self, observations):
+        one_sided = KNOWN.model_copy(update={"overshoot_deg": 0.5})
+        priors = priors_of([one_sided, KNOWN, UNKNOWN], observations)
+        degrees = torch.rad2deg(priors.backlash_sigma).tolist()
+        assert degrees == pytest.approx([0.0, 0.5, 0.1])
+        assert math.degrees(priors.tilt_zero_sigma[0]) == pytest.approx(math.hypot(0.2, 0.25))
+
     def test_metres(self, priors):
         assert priors.pupil_m[:, 0].tolist() == [0.03, 0.0, 0.0]
         assert priors.pupil_sigma_m[:, 0].tolist() == [0.02, 0.05, 0.05]

@@ -319,6 +319,16 @@ class TestFailures:
         assert "interrupted" in result.error
         assert ZoomTable.load(run / result.table).zooms == [1.0]
 
+    def test_what_is_not_to_be_trusted_becomes_no_table(self, run):
+        record = collected(run, "bad", (1.0, of(BARREL)))
+        assert solve(run).cameras["bad"].ok
+        record.untrue = "the head lost its place"
+        record.save(run / "bad")
+        result = self.reported(run)
+        assert result.table is None
+        assert not (run / "bad" / "table.json").exists()
+        assert "lost its place" in result.error
+
     def test_a_zoom_without_a_pattern(self, run):
         record = collected(run, "bad", (1.0, of(BARREL)), (4.0, None))
         record.zooms[1].error = "the ball is hidden"
