@@ -297,10 +297,13 @@ def _head(camera: str, head: HeadResult, truth: CameraTruth) -> list[HeadFigure]
         # Approached upwards the load always stays behind the motor, by half of the play.
         tilt_zero -= truth.head["backlash_deg"][1] / 2
     figures = [
-        HeadFigure(camera, "tilt zero", head.tilt_zero_deg, head.tilt_zero_sigma_deg, tilt_zero),
         HeadFigure(camera, "boresight", head.boresight_deg, head.boresight_sigma_deg, boresight),
         HeadFigure(camera, "roll", head.roll_deg, head.roll_sigma_deg, roll),
     ]
+    # Of axes that pictures taught, the zero is theirs and not the device's.
+    if head.axis_scale is None:
+        sigma = head.tilt_zero_sigma_deg
+        figures.insert(0, HeadFigure(camera, "tilt zero", head.tilt_zero_deg, sigma, tilt_zero))
     for axis, name in enumerate(("pan", "tilt")) if head.backlash_deg else ():
         play = truth.head["backlash_deg"][axis]
         found, sigma = head.backlash_deg[axis], head.backlash_sigma_deg[axis]

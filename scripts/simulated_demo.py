@@ -204,7 +204,7 @@ def draw(
         if not (folder / TABLE_NAME).exists():
             raise ValueError("it has no table")
         lens = tp.ZoomTable.load(folder / TABLE_NAME).at(1.0)
-        before = photograph_board(camera, simulated)
+        before = photograph_board(camera, simulated, folder)
     except (CameraError, ValueError) as error:
         say(console, f"{camera.name}: no pictures of its checkerboard: {error}")
         return paths

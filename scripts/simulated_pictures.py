@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchptz.cameras import CameraError, Pose, open_camera
+from torchptz.cameras import CameraError, HeadAxes, Pose, open_camera
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.journal import JOURNAL_NAME, read_journal
 from torchptz.fleet.records import CameraRecord
@@ -24,8 +25,14 @@ _STILL_PX = 0.3
 _MOST_PICTURES = 40
 
 
-def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.ndarray | None:
+def photograph_board(
+    config: CameraConfig, simulated: SimulationConfig, folder: Path
+) -> np.ndarray | None:
     """A camera's checkerboard at the widest zoom, with the head at rest.
+
+    Args:
+        config, simulated: of the camera.
+        folder: of the camera in the run, where it stands what its units mean.
 
     Returns:
         (H, W, 3) uint8 BGR; None where the camera has no board.
@@ -47,6 +54,7 @@ def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.nd
         undo.callback(camera.close)
         undo.callback(camera.restore)
         camera.connect()
+        camera.learn(axes=_as_learnt(camera.axes, CameraRecord.load(folder)))
         camera.prepare()
         can, timing = camera.capabilities, config.timing
         pose = can.nearest_reachable(math.radians(board.pan_deg), math.radians(board.tilt_deg))
@@ -67,6 +75,20 @@ def photograph_board(config: CameraConfig, simulated: SimulationConfig) -> np.nd
         f"camera {config.name}: the board's picture does not come to rest in {_MOST_PICTURES} "
         "pictures; is something moving in it?"
     )
+
+
+def _as_learnt(axes: HeadAxes, record: CameraRecord) -> HeadAxes:
+    """Axes with what the record says of their units."""
+    if record.axes is None:
+        return axes
+    pan, tilt = (
+        replace(axis, scale=math.radians(scale), offset=math.radians(offset))
+        for axis, (scale, offset) in (
+            (axes.pan, record.axes["pan"]),
+            (axes.tilt, record.axes["tilt"]),
+        )
+    )
+    return replace(axes, pan=pan, tilt=tilt)
 
 
 def draw_collected(folder: Path, zoom_index: int = 0) -> Figure | None:

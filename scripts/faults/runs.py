@@ -20,7 +20,7 @@ from torchptz.simulation import SimulationConfig, load_truth, serve_in_process
 
 TITLE = "Faults of cameras and what becomes of them"
 
-GROUP = 4  # cameras with faults that are calibrated at the same time, beside a healthy one
+GROUP = 6  # cameras with faults that are calibrated at the same time, beside a healthy one
 LIMIT_S = 420.0  # for a group: what takes longer hangs
 CONTROL = "control"
 _QUICK = ("nothing", "head_stuck", "lockout_after 5", "second_operator_s 90", "wrong_host")

@@ -94,6 +94,9 @@ def head_line(head: HeadResult) -> str:
     if head.backlash_deg is not None:
         plays = map(angle, head.backlash_deg, head.backlash_sigma_deg)
         values["backlash"] = " and ".join(plays)
+    if head.axis_scale is not None:
+        shares = zip(head.axis_scale, head.axis_scale_sigma, strict=True)
+        values["degrees over learnt degrees"] = " and ".join(f"{a:.4f}±{b:.4f}" for a, b in shares)
     values["readings good to"] = " and ".join(quanta)
     return ", ".join(f"{name} {value}" for name, value in values.items())
 

@@ -138,6 +138,11 @@ class Collector:
         record.quantum_deg = [math.degrees(can.pan_quantum), math.degrees(can.tilt_quantum)]
         record.max_magnification = can.max_magnification
         record.overshoot_deg = math.degrees(overshoot)
+        if camera.axes is not None:
+            record.axes = {
+                name: [math.degrees(axis.scale), math.degrees(axis.offset)]
+                for name, axis in (("pan", camera.axes.pan), ("tilt", camera.axes.tilt))
+            }
         record.axis_scale_sigma = list(can.scale_sigma)
         record.tilt_zero_sigma_deg = math.degrees(can.tilt_zero_sigma)
         if can.horizontal_fov is not None:

@@ -186,7 +186,7 @@ class ScanConfig(Section):
         0.5,
         ge=0,
         le=10,
-        description="degrees; poses on lines are approached from below on both axes, from so far, "
+        description="degrees; poses are approached with both angles growing, from so far before, "
         "more than the head's play; 0: from wherever the head is",
     )
     tracks: int = Field(

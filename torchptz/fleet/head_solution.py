@@ -87,7 +87,7 @@ def _solution(record: CameraRecord, observations: Observations, one: Calibration
     return Solution(
         tuple(zooms),
         tuple(knots),
-        head=_head(one, observations.quantum[0], record.overshoot_deg > 0),
+        head=_head(one, observations.quantum[0], record),
         # Without what no camera can know: it says nothing of this one.
         undetermined=tuple(str(thing) for thing in one.undetermined[0] if not thing.gauge),
     )
@@ -166,8 +166,9 @@ def _zoom(
     return result, knot
 
 
-def _head(one: Calibration, quantum: Tensor, one_sided: bool) -> HeadResult:
-    """quantum: (2,) rad. one_sided: every look was approached from the same side."""
+def _head(one: Calibration, quantum: Tensor, record: CameraRecord) -> HeadResult:
+    """quantum: (2,) rad."""
+    one_sided, learnt = record.overshoot_deg > 0, max(record.axis_scale_sigma) > 0
 
     def degrees(*values: Tensor) -> tuple[float, ...]:
         return tuple(math.degrees(value) for value in values)
@@ -186,6 +187,10 @@ def _head(one: Calibration, quantum: Tensor, one_sided: bool) -> HeadResult:
         backlash_sigma_deg=None
         if one_sided
         else degrees(sigma["pan backlash"], sigma["tilt backlash"]),
+        axis_scale=tuple(one.axis_scale[0].tolist()) if learnt else None,
+        axis_scale_sigma=(float(sigma["pan scale"]), float(sigma["tilt scale"]))
+        if learnt
+        else None,
         reading_sigma_deg=degrees(*noise),
         reading_sigma_quanta=tuple(
             float(n / q) if q > 0 else None for n, q in zip(noise, quantum, strict=True)

@@ -79,6 +79,8 @@ class CameraRecord(_Record):
     # ``systematic`` has them
     head_errors: dict[str, Annotated[float, Field(ge=0)]] = {}
     quantum_deg: Pair | None = None  # smallest steps of pan and tilt, 0: continuous; None: unknown
+    # Degrees per unit of the device, and degrees at 0 units, as it says or as pictures taught
+    axes: dict[str, Pair] | None = None
     # How far the device's units may be off, one sigma: relative, of pan and tilt; degrees
     axis_scale_sigma: Pair = [0.0, 0.0]
     tilt_zero_sigma_deg: float = Field(0.0, ge=0)

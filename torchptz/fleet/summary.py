@@ -54,6 +54,10 @@ class HeadResult:
     backlash_sigma_deg: tuple[float, float] | None
     reading_sigma_deg: tuple[float, float]  # noise of what pan and tilt read, as found
     reading_sigma_quanta: tuple[float | None, float | None]  # None: a continuous axis
+    # True angles of pan and tilt over those of the axes as pictures taught them, whose zero the
+    # tilt's is, too; None: the device's units are degrees
+    axis_scale: tuple[float, float] | None = None
+    axis_scale_sigma: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
