@@ -3,8 +3,9 @@
 `benchmark.py accuracy --json FILE` measures how accurate the estimator is, `head` what the complete
 calibration makes of imperfect heads, `estimate` and `rectify` how fast both are beside other
 programs, `faults` what becomes of cameras with which something is wrong, each section by section
-(the modules of the packages of those names). The exit code is 0 only if every check holds: 1 if one does not or a section failed, 2 if the command was called
-wrongly, 130 if it was interrupted. What was measured until then is in the file.
+(the modules of the packages of those names). The exit code is 0 only if every check holds: 1 if one
+does not or a section failed, 2 if the command was called wrongly, 130 if it was interrupted. What
+was measured until then is in the file.
 `benchmark.py readme --json FILE ...` puts the tables of such files into the README.
 """
 

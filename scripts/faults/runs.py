@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import click
 from demo_check import WORST_LIMIT, fleet_figures
 
 from faults.catalogue import CASES, Case
@@ -77,6 +78,10 @@ def run(quick: bool) -> dict:
     for first in range(0, len(cases), GROUP):
         group = [*cases[first : first + GROUP], Case({}, name="healthy neighbour")]
         *own, control = _calibrated(group)
+        for one in (*own, control):
+            click.echo(
+                f"  {one.verdict}: {one.case} ({one.dialect}), {one.seconds:.0f} s: {one.said}"
+            )
         outcomes += own
         controls.append(control)
     return {

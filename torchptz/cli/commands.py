@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -31,7 +33,8 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context):
         try:
-            return super().invoke(ctx)
+            with _ended_in_order():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             # Collecting has sent every head back by now, and what was collected is on disk.
             click.echo("torchptz: interrupted; what was finished is kept", err=True)
@@ -42,6 +45,26 @@ class _Commands(click.Group):
             logger.debug("traceback", exc_info=True)
             click.echo(f"torchptz: {one_line(error)}", err=True)
             ctx.exit(2)
+
+
+@contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """What ends a program otherwise, or closes its terminal, interrupts it: heads are sent back."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    ending = [kind for name in ("SIGTERM", "SIGHUP") if (kind := getattr(signal, name, None))]
+    in_main = threading.current_thread() is threading.main_thread()  # others take no signals
+    # What somebody has a use for, or ignores (nohup), is left alone.
+    ending = [kind for kind in ending if in_main and signal.getsignal(kind) is signal.SIG_DFL]
+    for kind in ending:
+        signal.signal(kind, interrupt)
+    try:
+        yield
+    finally:
+        for kind in ending:
+            signal.signal(kind, signal.SIG_DFL)
 
 
 def _is_expected(error: Exception) -> bool:

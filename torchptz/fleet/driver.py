@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 from torchptz.fleet.collector import Collector, Progress
 from torchptz.fleet.config import FleetConfig
 from torchptz.fleet.records import CameraRecord
+from torchptz.fleet.workers import run_workers
 
 
 def collect(
@@ -34,12 +34,4 @@ def collect(
         camera.name: Collector(camera, out / camera.name, stop, progress)
         for camera in config.cameras
     }
-    with ThreadPoolExecutor(max_workers=len(collectors)) as workers:
-        try:
-            running = {name: workers.submit(one.run) for name, one in collectors.items()}
-            wait(running.values())
-        except BaseException:  # the interrupt, or what the handler of another signal raises
-            # Leaving the with block waits for the workers, which put their heads back first.
-            stop.set()
-            raise
-    return {name: future.result() for name, future in running.items()}
+    return run_workers({name: one.run for name, one in collectors.items()}, stop)

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from torchptz.cameras import Camera, CameraError, Pose
 from torchptz.cameras.axes import Axis, HeadAxes
+from torchptz.cameras.zoom_curve import ZoomCurve
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.probe_mechanics import measure_mechanics, watch_motion
 from torchptz.fleet.probe_report import Check, ProbeReport, described
@@ -53,7 +54,7 @@ def probe(
 
     Returns:
         ProbeReport; of a camera that cannot be used it says why in ``refused``, and its driver
-        believes of its axes what it did before.
+        believes of its axes and zoom what it did before.
 
     Raises:
         Stopped: it was asked to stop.
@@ -71,6 +72,7 @@ class _Probe:
         stop: threading.Event,
     ) -> None:
         self._camera = camera
+        self._config = config
         self._tell = progress
         self._short = short
         self._report = ProbeReport(config.name, camera.identity)
@@ -79,18 +81,20 @@ class _Probe:
 
     def run(self) -> ProbeReport:
         camera, report = self._camera, self._report
-        began, believed, start = time.monotonic(), camera.axes, None
+        began, start, passed = time.monotonic(), None, False
+        believed = camera.axes, camera.zoom_curve
         try:
             start = camera.position()
             if not self._short:
                 camera.prepare()
             self._check(start)
+            passed = True
         except CameraError as error:
             text = str(error)
             report.refused = text if text.startswith("camera ") else f"{self._name}: {text}"
         finally:
             if start is not None:
-                self._put_back(start, believed)
+                self._put_back(start, believed, passed)
         report.notes += self._look.notes()
         report.capabilities = described(camera.capabilities)
         report.moves, report.seconds = self._look.moves, time.monotonic() - began
@@ -126,6 +130,7 @@ class _Probe:
         self._tell("probing: mechanics", 4, _STAGES)
         if learnt.px_per_rad is not None:
             measure_mechanics(self._look, here, learnt.px_per_rad[1], report)
+        self._configured_zooms()
 
     # ---- parts
 
@@ -248,28 +253,43 @@ class _Probe:
         text = f"within {100 * off:.0f} % of what it says up to {learnt.curve.limits[1]:g} units"
         report.checks.append(Check("zoom range", off < 2 * _ZOOM_OFF, text + _digital(learnt)))
 
+    def _configured_zooms(self) -> None:
+        """Whether the lens has them: a collection would refuse them, too."""
+        most = self._camera.capabilities.max_magnification
+        beyond = [f"{zoom:g}" for zoom in self._config.zooms if zoom > most * (1 + 1e-6)]
+        if beyond:
+            raise CameraError(
+                f"{self._name}: its lens goes to {most:.4g}x, and zooms asks for "
+                f"{', '.join(beyond)}; take them out"
+            )
+
     # ---- leaving
 
-    def _put_back(self, start: Pose, believed: HeadAxes) -> None:
-        """Send the head to where it was, and restore what was prepared. Raises nothing."""
+    def _put_back(self, start: Pose, believed: tuple[HeadAxes, ZoomCurve], passed: bool) -> None:
+        """Send the head to where it was, and restore what was prepared. Raises nothing.
+
+        believed: what ``start`` is a pose of, and so are the caller's; unless the camera passed,
+            its driver goes back to it.
+        """
         camera = self._camera
+        learnt = camera.axes, camera.zoom_curve
+        camera.learn(*believed)
         low, high = camera.zoom_curve.limits
-
-        def back() -> None:
-            # Beyond the optical range only restore() can go.
-            pose = replace(start, zoom=min(max(start.zoom, low), high))
-            if self._report.refused is not None:
-                # The caller's poses are of the axes as they were.
-                camera.learn(axes=believed)
-            pose = _same_place(pose, believed, camera.axes)
-            # What the next one does must not meet a head on its way.
-            self._look.head.go(pose) if self._short else camera.move(pose)
-
-        for action in (back,) if self._short else (back, camera.restore):
+        # Beyond the optical range only restore() can go.
+        pose = replace(start, zoom=min(max(start.zoom, low), high))
+        # What the next one does must not meet a head on its way.
+        send = self._look.head.go if self._short and passed else camera.move
+        steps = [(f"its head was at {_told(pose)}", lambda: send(pose))]
+        if not self._short:
+            steps.append(("its settings are not all as they were", camera.restore))
+        for left, action in steps:
             try:
                 action()
             except (CameraError, Stopped) as error:
                 logger.warning("%s: while putting it back: %s", self._name, error)
+                self._report.notes.append(f"it could not be put back: {left}")
+        if passed:
+            camera.learn(*learnt)
 
     @property
     def _name(self) -> str:
@@ -280,6 +300,11 @@ def _same_place(pose: Pose, old: HeadAxes, new: HeadAxes) -> Pose:
     """A pose of the old axes in new ones."""
     pan = new.pan.angle(old.pan.units(pose.pan))
     return replace(pose, pan=pan, tilt=new.tilt.angle(old.tilt.units(pose.tilt)))
+
+
+def _told(pose: Pose) -> str:
+    pan, tilt = math.degrees(pose.pan), math.degrees(pose.tilt)
+    return f"pan {pan:.2f}, tilt {tilt:.2f} deg, zoom {pose.zoom:g} units"
 
 
 def _within(angle: float, axis: Axis) -> bool:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
 from pathlib import Path
 
 from torchptz.cameras import CameraError, open_camera
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.probe import Told, probe
-from torchptz.fleet.probe_report import ProbeReport
+from torchptz.fleet.probe_report import REPORT_NAME, ProbeReport
+from torchptz.fleet.workers import run_workers
 from torchptz.scanning.head_motion import Stopped
 
 logger = logging.getLogger(__name__)
@@ -33,26 +34,30 @@ def probe_fleet(
         Reports by name. What goes wrong with a camera stands in its report, and stops no other.
 
     Raises:
+        OSError: a folder cannot be made; nothing was sent to any camera.
         KeyboardInterrupt: after every head was sent back.
     """
     stop = threading.Event()
+    if out is not None:
+        for config in cameras:
+            (out / config.name).mkdir(parents=True, exist_ok=True)
 
     def one(config: CameraConfig) -> ProbeReport:
         report = _connected(config, lambda *what: progress(config.name, *what), stop)
         if out is not None:
-            report.save(out / config.name)
+            _save(report, out / config.name)
         progress(config.name, "passed" if report.passed else "refused", 1, 1)
         return report
 
-    with ThreadPoolExecutor(max_workers=max(len(cameras), 1)) as workers:
-        try:
-            running = {config.name: workers.submit(one, config) for config in cameras}
-            wait(running.values())
-        except BaseException:
-            # Leaving the with block waits for the workers, which put their heads back first.
-            stop.set()
-            raise
-    return {name: future.result() for name, future in running.items()}
+    return run_workers({config.name: partial(one, config) for config in cameras}, stop)
+
+
+def _save(report: ProbeReport, folder: Path) -> None:
+    """A report that cannot be stored is still returned."""
+    try:
+        report.save(folder)
+    except OSError as error:
+        logger.warning("camera %s: no %s is written: %s", report.name, REPORT_NAME, error)
 
 
 def _connected(config: CameraConfig, progress: Told, stop: threading.Event) -> ProbeReport:

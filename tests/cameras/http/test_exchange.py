@@ -43,7 +43,7 @@ ATTACKS = {
     "garbage in place of headers": (lambda: endless(b"\xfe:\x01\r\n", HEAD), "headers"),
     "another version": (lambda: [b"HTTP/9.9 200 OK\r\n\r\n"], "speak HTTP"),
     "another status": (lambda: [b"HTTP/1.1 " + b"9" * 5000 + b" OK\r\n\r\n"], "speak HTTP"),
-    "endless body": (lambda: endless(b"x", HEAD + b"\r\n"), "more than 65536 bytes"),
+    "endless body": (lambda: endless(b"x", HEAD + b"\r\n"), "more than 262144 bytes"),
     "a huge length": (
         lambda: drip(b"x", HEAD + b"Content-Length: 1000000000\r\n\r\n"),
         "announces 1000000000",
@@ -69,7 +69,7 @@ ATTACKS = {
     ),
     "a huge chunk": (
         lambda: endless(b"x", HEAD + b"Transfer-Encoding: chunked\r\n\r\nFFFFFFFFFFFF\r\n"),
-        "more than 65536 bytes",
+        "more than 262144 bytes",
     ),
     "a chunk without a length": (
         lambda: [HEAD + b"Transfer-Encoding: chunked\r\n\r\n-5\r\nzz\r\nxx"],
@@ -124,7 +124,7 @@ class TestHostileServer:
         other = device(lambda _: HEAD + b"\r\n")
         location = f"Location: http://{other.address}/stolen?x=1\r\n\r\n".encode()
         fake = device(lambda _: endless(b"x", b"HTTP/1.1 302 Found\r\n" + location))
-        with pytest.raises(ProtocolError, match="more than 65536 bytes"):
+        with pytest.raises(ProtocolError, match="more than 262144 bytes"):
             connect(fake.address).get("/")
         assert other.requests == []
 

@@ -54,7 +54,7 @@ class TestSecrets:
             "no HTTP": (behind_login(lambda _: b"nonsense\r\n"), "get"),
             "short": (behind_login(lambda _: http_reply(body=b"1", length=9)), "get"),
             "busy": (behind_login(lambda _: http_reply(503)), "get"),
-            "too long": (behind_login(lambda _: http_reply(body=b"x" * 70_000)), "get"),
+            "too long": (behind_login(lambda _: http_reply(body=b"x" * 300_000)), "get"),
             "cut picture": (behind_login(lambda _: http_reply(body=picture[:300])), "get_picture"),
             "not allowed": (behind_login(lambda _: http_reply(403)), "get_picture"),
         }

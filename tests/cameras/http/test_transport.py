@@ -262,7 +262,7 @@ class TestNoAnswer:
                 yield b"x" * 4096
 
         fake = device(flood)
-        with pytest.raises(ProtocolError, match="more than 65536 bytes"):
+        with pytest.raises(ProtocolError, match="more than 262144 bytes"):
             connect(fake.address).get("/")
 
 

@@ -61,13 +61,13 @@ class Failure(Exception):
         way_out: str,
         *,
         again: bool,
-        nothing_sent: bool = False,
+        nothing_done: bool = False,
         wait_s: float = 0.0,
     ) -> None:
         super().__init__(cause)
         self.outcome = (kind, cause, way_out)
         self.again = again  # another attempt may help
-        self.nothing_sent = nothing_sent  # the camera cannot have acted on it
+        self.nothing_done = nothing_done  # the camera has not acted on it
         self.wait_s = wait_s  # the camera asks for this pause
 
 
@@ -104,6 +104,8 @@ class Exchange:
             "Accept-Encoding": "identity",
             # A body whose length the firmware got wrong then still ends with the connection.
             "Connection": "close",
+            # Firmware that guards against forged requests wants to be where they come from.
+            "Referer": self._base + "/",
         }
         # Prepared once and then copied, which is cheaper, and sends nothing that is not here.
         self._template = requests.Request("GET", self._base + "/", headers=headers).prepare()
@@ -207,7 +209,7 @@ class Exchange:
             Trouble.BROKEN: (f"cannot be reached or hung up ({reason})", ""),
         }[trouble]
         way_out = f"check its power, address and network{option}"
-        return Failure(ConnectionFailed, cause, way_out, again=True, nothing_sent=nothing_sent)
+        return Failure(ConnectionFailed, cause, way_out, again=True, nothing_done=nothing_sent)
 
     def _untrusted(self, reason: str) -> Failure:
         fingerprint = shown_fingerprint(*split_address(self._address), self._timeouts[0])

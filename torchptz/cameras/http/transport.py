@@ -32,7 +32,7 @@ __all__ = ["MAX_TEXT_BYTES", "CameraTransport", "Reply"]
 
 logger = logging.getLogger(__name__)
 
-MAX_TEXT_BYTES = 2**16
+MAX_TEXT_BYTES = 2**18  # a recorder describes many channels
 _BUSY = 503  # too many viewers, or a motor command still in progress: passes by itself
 _LONGEST_RETRY_AFTER_S = 2.0
 _LOGIN_PAUSE = 10  # a camera's connections are freed within seconds: times pause_s
@@ -112,8 +112,8 @@ class CameraTransport:
         """Send a request of any method; the reply's status is for the caller.
 
         repeatable: sending the request twice has the effect of sending it once (inquiries,
-        absolute targets, modes); only then is a failed one sent again, unless there was no
-        connection. A 503 counts as failed. login=False: without credentials, and a 401 is a reply
+        absolute targets, modes); only then is a failed one sent again, unless the device did
+        nothing: there was no connection, or it was busy (503), which counts as failed. login=False: without credentials, and a 401 is a reply
         like others.
 
         Raises AuthenticationError, ConnectionFailed, ProtocolError; ValueError for no method.
@@ -125,7 +125,8 @@ class CameraTransport:
         return self._repeat(lambda: self._get_text(order), repeatable)
 
     def get_picture(self, path: str) -> np.ndarray | Reply:
-        """GET a JPEG, complete and decoded: (H, W, 3) uint8, BGR; a reply of status 404 as it is.
+        """GET a JPEG, complete and decoded: (H, W, 3) uint8, BGR; a reply of status 400 or 404 as
+        it is.
 
         The bytes count, not what the reply calls them. A damaged one is fetched again. Raises
         BadPicture and what get() raises.
@@ -169,7 +170,7 @@ class CameraTransport:
                     return attempt()
                 except Failure as failed:
                     kind, cause, way_out = failed.outcome
-                    again = failed.again and (repeatable or failed.nothing_sent)
+                    again = failed.again and (repeatable or failed.nothing_done)
                     wait_s = failed.wait_s
                 if not again or count == self._attempts:
                     break
@@ -218,7 +219,7 @@ class CameraTransport:
 
     def _get_picture(self, order: Order) -> np.ndarray | Reply:
         reply = self._ask(order)
-        if reply.status == 404:
+        if reply.status in (400, 404):  # of another size, or elsewhere: the dialect knows
             return reply
         if reply.status != 200:
             cause, way_out = _status(reply, "the request for a picture")
@@ -273,7 +274,7 @@ def _busy(reply: Reply, kind: type[CameraError], cause: str) -> Failure:
     asked = reply.headers.get("retry-after", "")
     wait_s = float(asked) if asked.isdecimal() else 0.0
     wait_s = min(wait_s, _LONGEST_RETRY_AFTER_S)
-    return Failure(kind, cause, _HINTS[_BUSY], again=True, wait_s=wait_s)
+    return Failure(kind, cause, _HINTS[_BUSY], again=True, wait_s=wait_s, nothing_done=True)
 
 
 def _as_text(body: bytes) -> str:
