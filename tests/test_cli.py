@@ -516,3 +516,22 @@ def test_an_interrupt_says_what_is_kept_and_has_a_code_of_its_own(tmp_path, monk
     result = CliRunner().invoke(main, ["solve", str(tmp_path)])
     assert result.exit_code == 130
     assert "interrupted; what was finished is kept" in result.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+@pytest.mark.parametrize("kind", ["SIGTERM", "SIGHUP"])
+def test_what_ends_a_program_otherwise_interrupts_it_too(tmp_path, monkeypatch, kind):
+    kind = getattr(signal, kind)
+
+    def ended(*_, **__):
+        signal.raise_signal(kind)
+
+    monkeypatch.setattr("torchptz.fleet.solve.solve", ended)
+    before = signal.signal(kind, signal.SIG_DFL)
+    try:
+        result = CliRunner().invoke(main, ["solve", str(tmp_path)])
+        assert signal.getsignal(kind) is signal.SIG_DFL
+    finally:
+        signal.signal(kind, before)
+    assert result.exit_code == 130
+    assert "interrupted; what was finished is kept" in result.stderr

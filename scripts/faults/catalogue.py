@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 _DEAF = r"does not move|does not follow|view from before|did not move|nothing moves"
 _ELSEWHERE = r"stopped elsewhere|where the scan began|still moving"
 _STEERED = r"another user|moved \d+ times|did not come to rest|stopped elsewhere|where the scan"
-_UNTRUE = r"where the scan began|OUTLIERS|MISFIT|NOT_CONVERGED|not be trusted"
+_UNTRUE = r"where the scan began|come to rest|outliers|misfit|not be trusted"
 _NO_ANSWER = r"cannot be reached|silent|did not accept|hung up|closed the connection|longer than"
 _NO_SENSE = r"HTTP|bytes|headers?|answer"
 _LOST = r"feature (was|is) (lost|not)|no feature|not seen|not found|only \d+ of"
@@ -64,7 +64,8 @@ CASES: tuple[Case, ...] = (
     _on("truncated_jpeg_with_length_every", 5),
     _on("one_shot_nonce", dialect="axis"),
     _on("one_shot_nonce", dialect="hikvision"),
-    _on("connection_cap", 1, "axis", refusals="limit of connections"),
+    _on("connection_cap", 1, "axis", refusals="limit of connections", table=False),
+    _on("connection_cap", 6, "axis", refusals="limit of connections", later=True),
     _on("lockout_after", 5, password="wrong", refusals="refuses the credentials", table=False),
     _on("lockout_after", 5, "axis", password="wrong", refusals="credentials", table=False),
     _on("lockout_after", 5, "onvif", password="wrong", refusals="credentials", table=False),
@@ -118,12 +119,17 @@ CASES: tuple[Case, ...] = (
     _on("backlash_first_step", 2.0),
     _on("overshoot_deg", 0.5, "axis"),
     _on("coast_deg", 0.3, "onvif", refusals=_ELSEWHERE),
-    _on("drift_deg_per_minute", 0.5, refusals=_UNTRUE),
+    # a hundred times as much by the wall's clock, as all of the head's times
+    _on("drift_deg_per_minute", 0.001, refusals=_UNTRUE),
+    _on("drift_deg_per_minute", 0.01, refusals=_UNTRUE),
+    _on("drift_deg_per_minute", 0.001, "axis", refusals=_UNTRUE),
+    _on("drift_deg_per_minute", 0.01, "axis", refusals=_UNTRUE, table=False),
     _on("drift_deg_per_minute", 5.0, "axis", refusals=_UNTRUE, table=False),
     _on("zero_loss_deg", 1.0, refusals=_UNTRUE),
     _on("auto_flip", dialect="hikvision"),
     _on("return_home_s", 60.0, refusals=_STEERED),
     _on("second_operator_s", 90.0, refusals=_STEERED),
+    _on("second_operator_s", 1500.0, refusals=_STEERED),
     # lens and picture
     _on("focus_hunting", dialect="axis"),
     _on("focus_hunting", dialect="sony_rz30"),

@@ -11,6 +11,7 @@ import pytest
 
 from torchptz.cameras import CameraError, Pose, open_camera
 from torchptz.fleet import probe_fleet as module
+from torchptz.fleet.config import parse_config
 from torchptz.fleet.probe import probe
 from torchptz.fleet.probe_fleet import probe_fleet
 from torchptz.fleet.probe_mechanics import watch_motion
@@ -112,6 +113,23 @@ class TestShort:
             assert reason in report.refused
             assert camera.axes == before
 
+    def test_stopped_once_axes_were_learnt_it_believes_what_its_caller_does(self, opened):
+        with opened({"faults": {"pan_reversed": True}}) as (camera, config, simulated):
+            simulated.move_to(-0.4, 0.3, 5.0, 5.0)
+            settled(simulated)
+            stop, believed, begun = threading.Event(), camera.axes, simulated.reading()
+
+            def progress(what, done, total):
+                if what == "probing: zoom":
+                    assert camera.axes != believed
+                    stop.set()
+
+            with pytest.raises(Stopped):
+                probe(camera, config, progress, short=True, stop=stop)
+            assert camera.axes == believed
+            settled(simulated)
+            assert simulated.reading()[:2] == pytest.approx(begun[:2], abs=1e-9)
+
     def test_what_pictures_cannot_show_is_no_reason_to_refuse(self, opened):
         with opened({"scene": {"board": None, "plain_background": 60.0, "highlights": []}}) as (
             camera,
@@ -175,6 +193,28 @@ class TestFull:
             assert simulated.reading() == pytest.approx(begun, abs=1e-9)
             assert simulated.digital_zoom
 
+    def test_zooms_that_the_lens_does_not_have_are_refused_as_by_a_collection(self, opened):
+        with opened(zooms=[1.0, 99.0]) as (camera, config, _):
+            report = probe(camera, config)
+            assert "its lens goes to 25x, and zooms asks for 99; take" in report.refused
+            assert verdicts(report)["axes"]
+
+    def test_a_camera_that_goes_away_leaves_a_note_of_where_it_was(self, opened, monkeypatch):
+        with opened() as (camera, config, simulated):
+            simulated.move_to(-0.4, 0.3, 5.0, 5.0)
+            settled(simulated)
+
+            def progress(what, done, total):
+                if what == "probing: axes":
+                    simulated.set_faults(refuse_connections=True)
+
+            report = probe(camera, config, progress)
+        assert "cannot be reached" in report.refused
+        assert report.notes == [
+            "it could not be put back: its head was at pan -22.92, tilt 17.17 deg, zoom 0 units",
+            "it could not be put back: its settings are not all as they were",
+        ]
+
 
 class TestMotionFlag:
     @pytest.mark.parametrize(
@@ -213,6 +253,25 @@ class TestFleet:
             assert stored["capabilities"]["pan_deg"] == [-170.0, 170.0]
             everything = json.dumps([report.as_dict() for report in reports.values()])
             assert not any(secret in everything for secret in fleet.secrets.values())
+
+    def test_a_folder_that_cannot_be_made_is_told_before_anything_is_sent(self, tmp_path):
+        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
+        (tmp_path / "out").write_text("in the way")
+        told = []
+        with pytest.raises(OSError, match="out"):
+            probe_fleet(
+                parse_config({"cameras": [camera]}).cameras,
+                tmp_path / "out",
+                lambda *what: told.append(what),
+            )
+        assert told == []
+
+    def test_a_report_that_cannot_be_stored_is_returned(self, tmp_path, caplog):
+        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
+        (tmp_path / "gate" / "probe.json").mkdir(parents=True)
+        reports = probe_fleet(parse_config({"cameras": [camera]}).cameras, tmp_path)
+        assert "cannot be reached" in reports["gate"].refused
+        assert "camera gate: no probe.json is written" in caplog.text
 
 
 class TestPosition:

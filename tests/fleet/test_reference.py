@@ -79,3 +79,21 @@ class TestVisits:
         with pytest.raises(MotionError, match="not seen any more"):
             reference.visit()
         assert record.untrue
+
+
+class TestRepeatability:
+    def test_it_is_the_scatter_of_the_visits(self):
+        places = [0.0, 0.4, -0.5, 0.3, -0.2]
+        reference, _ = setup(moved=lambda number: places[number] * QUANTUM[0])
+        for _ in places:
+            reference.visit()
+        pan, tilt = reference.repeatability()
+        expected = math.degrees(np.std(places, ddof=1) * QUANTUM[0]) * math.cos(0.2)
+        assert pan == pytest.approx(expected, rel=0.02)
+        assert tilt < 0.02 * pan
+
+    def test_few_visits_do_not_tell(self):
+        reference, _ = setup()
+        reference.visit()
+        reference.visit()
+        assert reference.repeatability() is None

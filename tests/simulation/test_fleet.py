@@ -55,9 +55,9 @@ class TestFleet:
 def test_serve_announces_writes_the_truth_and_ends(tmp_path):
     until, told = threading.Event(), {}
 
-    def announce(addresses):
-        told.update(addresses)
-        told["status"] = inquire(addresses["b"], "b").status_code
+    def announce(fleet):
+        told.update(fleet.addresses)
+        told["status"] = inquire(fleet.addresses["b"], "b").status_code
         until.set()
 
     serve(CONFIG, tmp_path / "truth.json", announce, until)

@@ -268,14 +268,16 @@ def rectify(
 def simulate(config: Path, truth: Path | None, ready_file: Path | None) -> None:
     """Serve the simulated cameras of CONFIG until interrupted."""
     from torchptz.files import write_whole
-    from torchptz.simulation import serve
+    from torchptz.simulation import SimulatedFleet, serve
 
-    def announce(addresses: dict[str, str]) -> None:
-        for name, address in addresses.items():
+    def announce(fleet: SimulatedFleet) -> None:
+        for name, address in fleet.addresses.items():
             click.echo(f"{name}: {address}")
+        for name, fingerprint in fleet.fingerprints.items():
+            click.echo(f"{name}: https, fingerprint {fingerprint}")
         click.echo("serving; Ctrl-C ends it", err=True)
         if ready_file is not None:
-            write_whole(ready_file, json.dumps(addresses) + "\n")
+            write_whole(ready_file, json.dumps(fleet.addresses) + "\n")
 
     stop = threading.Event()
     # A shell starts what it runs in the background with Ctrl-C ignored, and ends it by SIGTERM.

@@ -171,6 +171,7 @@ class Collector:
             self._collect_zoom(observer, view, surveyed.ray, index, record.zooms[index], record)
             # A head that lost its place since then read poses that were not true.
             reference.visit()
+        record.measured_repeatability_deg = reference.repeatability()
 
     def _probe(self, camera: Camera, start: Pose, record: CameraRecord) -> Pose:
         """Check with pictures what the camera says of itself; returns where it began, as its axes

@@ -17,6 +17,7 @@ from torchptz.scanning.observation import Observation, Observer
 # and px.
 _QUANTA, _SIGMAS, _PIXELS = 2.5, 4 * math.sqrt(2), 1.5
 _ATTEMPTS = 2  # to see the feature
+_FEWEST_VISITS = 4  # that tell how well a head repeats
 
 
 class ReferencePose:
@@ -60,6 +61,14 @@ class ReferencePose:
                 f"({turned.max():.2g} degrees) beside where it was, and up to {limit.max():.1f} px "
                 "would be the head's own rounding"
             )
+
+    def repeatability(self) -> list[float] | None:
+        """Degrees of pan and tilt, one sigma, that the head repeats to at this pose; None where it
+        was visited too rarely to say."""
+        shifts = np.array([visit.shift_px for visit in self._record.reference])
+        if len(shifts) < _FEWEST_VISITS:
+            return None
+        return np.degrees(shifts.std(0, ddof=1) / self._focal).tolist()
 
     def _look(self) -> Observation | None:
         size = np.asarray(self._record.image_size, dtype=float)

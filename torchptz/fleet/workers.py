@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 logger = logging.getLogger(__name__)
@@ -26,29 +26,38 @@ def run_workers(
         What they returned, in their order.
 
     Raises:
-        KeyboardInterrupt, or what the handler of another signal raises: after all jobs have ended,
-        however often it comes.
+        KeyboardInterrupt, or what the handler of another signal raises: after all jobs that had
+        begun have ended, however often it comes.
         Exception: of the first job that raised one, after all have ended.
     """
-    running: dict[str, Future[Result]] = {}
-    with ThreadPoolExecutor(max_workers=max(len(jobs), 1)) as workers:
-        try:
-            for name, job in jobs.items():
-                running[name] = workers.submit(job)
-            wait(running.values())
-        except BaseException:
-            stop.set()
-            logger.warning("interrupted; every head is sent back first")
-            _wait_whatever_comes(running.values())
-            raise
+    running: dict[str, Future[Result]] = {name: Future() for name in jobs}
+    try:
+        for name, job in jobs.items():
+            threading.Thread(target=_work, args=(running[name], job), name=name).start()
+        wait(running.values())
+    except BaseException:
+        logger.warning("interrupted; every head is sent back first")
+        _end(running.values(), stop)
+        raise
     return {name: future.result() for name, future in running.items()}
 
 
-def _wait_whatever_comes(running: Iterable[Future]) -> None:
-    """Joining an interrupted thread would take it for ended: the program would leave its head."""
+def _work(future: Future[Result], job: Callable[[], Result]) -> None:
+    if not future.set_running_or_notify_cancel():
+        return
+    try:
+        future.set_result(job())
+    except BaseException as error:
+        future.set_exception(error)
+
+
+def _end(running: Collection[Future], stop: threading.Event) -> None:
+    """Wait for what has begun, by its future: an interrupted join() would take a thread for ended,
+    and the program would leave its head where it is."""
     while True:
         try:
-            wait(running)
+            stop.set()
+            wait([future for future in running if not future.cancel()])
             return
         except BaseException:
             logger.warning("the heads are still being sent back")

@@ -123,19 +123,20 @@ class SimulatedFleet:
 def serve(
     config: SimulationConfig | dict | str | Path,
     truth: str | Path | None = None,
-    announce: Callable[[dict[str, str]], None] | None = None,
+    announce: Callable[[SimulatedFleet], None] | None = None,
     until: threading.Event | None = None,
 ) -> None:
     """Runs a simulated fleet until `until` is set or the keyboard interrupts.
 
-    truth: where to write the truth file; announce: called with the addresses once all listen.
+    truth: where to write the truth file; announce: called with the fleet once all
+    of it listens.
     """
     until = until or threading.Event()
     with SimulatedFleet(config) as fleet:
         if truth is not None:
             fleet.write_truth(truth)
         if announce is not None:
-            announce(fleet.addresses)
+            announce(fleet)
         try:
             while not until.wait(0.5):
                 pass

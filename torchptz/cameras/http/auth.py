@@ -195,7 +195,11 @@ class Login:
             return self._give_up(cause, "give its credentials and open it again")
         if sent and not self._proven:
             cause = "refuses the credentials (401)"
-            return self._give_up(cause, "correct them and open it again")
+            way_out = (
+                "correct them and open it again; if they are right, it may be at its limit of "
+                "connections: close other clients"
+            )
+            return self._give_up(cause, way_out)
         challenges = parse_challenges(header)
         offered = self._choose(challenges)
         if not sent and challenges:

@@ -113,8 +113,8 @@ class CameraTransport:
 
         repeatable: sending the request twice has the effect of sending it once (inquiries,
         absolute targets, modes); only then is a failed one sent again, unless the device did
-        nothing: there was no connection, or it was busy (503), which counts as failed. login=False: without credentials, and a 401 is a reply
-        like others.
+        nothing: there was no connection, or it was busy (503), which counts as failed.
+        login=False: without credentials, and a 401 is a reply like others.
 
         Raises AuthenticationError, ConnectionFailed, ProtocolError; ValueError for no method.
         """
