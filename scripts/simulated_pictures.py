@@ -64,6 +64,7 @@ def photograph_board(
             threading.Event(),
             timing.settle_timeout_s,
             timing.poll_interval_s,
+            settle_s=timing.settle_s,
         )
         observer.go(Pose(*pose, can.zoom_limits[0]))
         picture = camera.snapshot()

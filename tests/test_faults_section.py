@@ -1,6 +1,7 @@
 """The section of faults: that every switch has its run, and what is called right and wrong."""
 
 import math
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from torchptz.fleet.summary import CameraResult, ZoomResult
+from torchptz.simulation import SimulationConfig
 from torchptz.simulation.faults import FaultConfig
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
@@ -19,6 +21,7 @@ try:  # as a script imports them, from its folder
 finally:
     sys.path.remove(str(SCRIPTS))
 
+HEALTHY, SLOWED = Case({}, "axis", name="nothing"), Case({"slow_reply_s": 0.02}, "axis")
 ZOOM = ZoomResult(1.0, 1.0, 0.0, True, "OK")
 
 
@@ -37,6 +40,39 @@ class TestCatalogue:
     def test_titles_tell_the_cases_apart(self):
         titles = [(case.title, case.dialect) for case in CASES]
         assert len(set(titles)) == len(titles)
+
+    def test_nothing_wrong_comes_before_what_is_compared_with_it(self):
+        first = {}
+        for case in CASES:
+            if case.must_not_matter:
+                first.setdefault(case.dialect, case)
+        assert len(first) == 6
+        assert all(case.title == "nothing" for case in first.values())
+
+    def test_nothing_wrong_is_no_reason_to_refuse(self):
+        cases = [case for case in CASES if case.refusals != Case({}).refusals]
+        said = "worst error 1.1 sigma; sigma up to 1.82 px; camera one (127.0.0.1:80): answered"
+        assert not [case.title for case in cases if re.search(case.refusals, said, re.IGNORECASE)]
+
+
+class TestSettings:
+    @staticmethod
+    def simulated(case):
+        return SimulationConfig.load({"cameras": [runs._simulated("one", case)]}).cameras[0]
+
+    def test_a_case_changes_what_it_names_of_the_head_and_no_more(self):
+        head = self.simulated(Case({}, simulated={"head": {"speed_up": 3.0}})).head
+        assert (head.speed_up, head.reading_jitter) == (3.0, 0.3)
+
+    def test_what_must_not_matter_has_the_lens_that_it_is_compared_with(self):
+        alike = [self.simulated(case).seed for case in (HEALTHY, SLOWED)]
+        other = self.simulated(replace(SLOWED, refusals="silent")).seed
+        assert alike[0] == alike[1] != other
+
+    def test_a_configuration_may_ask_the_served_fleet(self, tmp_path):
+        case = Case({}, config=lambda fleet, name: {"tls": {"fingerprint": fleet[name][::-1]}})
+        made = runs._configured("one", case, {"one": "abc"}, tmp_path)
+        assert (made["address"], made["tls"]) == ("abc", {"fingerprint": "cba"})
 
 
 class TestVerdicts:
@@ -83,12 +119,28 @@ class TestVerdicts:
         assert judge(Case({}, refusals="OUTLIERS"), result).verdict == "refused"
         assert judge(Case({}, refusals="reached"), result).verdict == "WRONG REASON"
 
+    def test_a_table_of_no_use(self):
+        healthy = {}
+        one = runs.Outcome("nothing", "axis", "table", "", 1.0, 0, 0.5)
+        assert runs._useful(HEALTHY, one, healthy) == one
+        for sigma, verdict in ((1.5, "table"), (1.6, "TABLE OF NO USE")):
+            found = runs._useful(SLOWED, replace(one, sigma_px=sigma), healthy)
+            assert (found.verdict, found.right) == (verdict, verdict == "table")
+        wide = replace(one, sigma_px=9.0)
+        assert runs._useful(replace(SLOWED, widens=True), wide, healthy) == wide
+        assert runs._useful(replace(SLOWED, refusals="silent"), wide, healthy) == wide
+
     def test_what_never_ends(self, judge):
         assert judge(Case({}), None).verdict == "HANG"
 
     def test_logins(self, judge):
         result = CameraResult((), None, "camera one: refuses the credentials")
-        case = Case({}, refusals="credentials", table=False)
+        case = Case({}, refusals="credentials", table=False, password="wrong")
         assert judge(case, result, rejected=1).right
         assert judge(case, result, rejected=2).verdict == "TOO MANY LOGINS"
         assert judge(replace(case, dialect="onvif"), result, rejected=2).right
+
+    def test_rejected_logins_are_no_better_with_a_table(self, judge):
+        result = CameraResult((ZOOM,), "table.json", None)
+        assert judge(Case({}), result, rejected=1).verdict == "TOO MANY LOGINS"
+        assert judge(Case({}, "onvif"), result, rejected=2).right

@@ -1,6 +1,7 @@
 """The command `torchptz probe`: its table, its files and its exit codes."""
 
 import json
+import logging
 from functools import partial
 
 import pytest
@@ -27,12 +28,21 @@ def fleet(tmp_path_factory):
         defaults = {
             "dialect": "sony_rz30",
             "zooms": [1.0],
-            "timing": {"poll_interval_s": 0.002},
+            "timing": {"poll_interval_s": 0.002, "settle_s": 0.005},
             "device": {"focus_wait_s": 0.01},
         }
         path = tmp_path_factory.mktemp("fleet") / "fleet.yaml"
         path.write_text(yaml.safe_dump({"defaults": defaults, "cameras": cameras}))
         yield path
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_it_was():
+    """Every call of the command sets what is logged, for the whole process."""
+    ours = logging.getLogger("torchptz")
+    level = ours.level
+    yield
+    ours.setLevel(level)
 
 
 @pytest.fixture

@@ -68,7 +68,7 @@ def fleet(
                         "points_per_line": settings.points_per_line,
                         "tracks": settings.tracks,
                     },
-                    "timing": {"poll_interval_s": 0.005},
+                    "timing": {"poll_interval_s": 0.005, "settle_s": 0.005},
                 }
             ]
         },

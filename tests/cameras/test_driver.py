@@ -1,6 +1,7 @@
 """What all drivers share: units on the grid, restricted capabilities, learning, undoing."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -20,8 +21,8 @@ ZOOM = ZoomCurve((10.0, 250.0), (1.0, 25.0))
 class Device(Driver):
     """A dialect without messages."""
 
-    def __init__(self):
-        super().__init__("gate", CameraTransport("gate", "host"))
+    def __init__(self, pan_sign=None, tilt_sign=None):
+        super().__init__("gate", CameraTransport("gate", "host"), (pan_sign, tilt_sign))
 
     def connect(self):
         self.axes, self.zoom_curve, self.horizontal_fov = AXES, ZOOM, 1.0
@@ -50,6 +51,12 @@ class TestUnits:
     def test_zooms_are_on_the_grid_of_the_device(self, device):
         assert device.zoom_units(2.37) == round(device.zoom_units(2.37))
         assert device.magnification(device.zoom_units(2.0)) == pytest.approx(2.0, rel=0.02)
+
+    def test_a_reading_a_little_beyond_an_end_is_the_end(self, device):
+        assert device.magnification(250.7) == pytest.approx(25.0)
+        assert device.magnification(9.3) == 1.0
+        with pytest.raises(MotionError, match="no optical zoom at 251 units"):
+            device.magnification(251.0)
 
     @pytest.mark.parametrize(
         ("pose", "words"),
@@ -104,13 +111,32 @@ class TestLearning:
         assert device.axes.signs_known
 
     def test_one_sign_alone_leaves_the_other_to_pictures(self):
-        assert not signed(AXES, 1, None).signs_known
-        assert signed(AXES, None, -1).tilt == AXES.tilt.reversed()
+        axes = signed(AXES, 1, None)
+        assert (axes.pan.sign_known, axes.tilt.sign_known, axes.signs_known) == (True, False, False)
+        axes = signed(AXES, None, -1)
+        assert axes.tilt == replace(AXES.tilt.reversed(), sign_known=True)
+        assert axes.pan == AXES.pan
+
+    def test_steps_and_limits_stay_the_device_s_own(self, device):
+        learnt = device.axes.tilt
+        told = replace(learnt, quantum=0.5, origin=0.25, limits=(-200, 900))
+        device.axes = HeadAxes(device.axes.pan, told)  # what replies told meanwhile
+        twice = replace(learnt, scale=2 * learnt.scale, offset=0.1, scale_sigma=0.0)
+        device.learn(axes=HeadAxes(device.axes.pan, twice))
+        now = device.axes.tilt
+        assert (now.quantum, now.origin, now.limits) == (0.5, 0.25, (-200, 900))
+        assert (now.scale, now.offset, now.scale_sigma) == (2 * learnt.scale, 0.1, 0.0)
+
+    def test_a_lens_goes_back_to_where_the_learnt_curve_does_not_reach(self, device):
+        device.learn(zoom=ZoomCurve((12.0, 120.0), (1.0, 12.0)))
+        assert device.capabilities.zoom_limits == (12.0, 120.0)
+        assert device.zoom_range == (10.0, 250.0)
+        assert device.device_units(Pose(0.0, 0.0, 250.0))[2] == 250
 
     @pytest.mark.parametrize("sign", [0, 2, True])
     def test_no_other_sign(self, sign):
-        with pytest.raises(ValueError, match="pan_sign must be 1, -1 or None"):
-            signed(AXES, sign, 1)
+        with pytest.raises(ValueError, match="camera gate: pan_sign must be 1, -1 or None"):
+            Device(sign, 1)
 
 
 class TestUndoing:

@@ -33,7 +33,7 @@ COLLECTED = {
     "feature": {"pan_deg": 18.0, "tilt_deg": 8.0},
     "zooms": [1.0, 12.0],
     "scan": {"horizontal": 4, "vertical": 4, "points_per_line": 7, "tracks": 4},
-    "timing": {"settle_timeout_s": 5.0, "poll_interval_s": 0.002},
+    "timing": {"settle_timeout_s": 5.0, "poll_interval_s": 0.002, "settle_s": 0.005},
 }
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from torchptz.cameras import CameraError, Capabilities, ConnectionFailed, Pose
+from torchptz.cameras.sony.zoom import curve
 from torchptz.fleet import collector as module
 from torchptz.fleet import survey
 from torchptz.fleet.collector import Collector
@@ -297,11 +298,17 @@ class TestFailure:
         assert_put_back(one.simulated, one.start)
 
     def test_a_zoom_that_the_lens_does_not_have(self, one):
-        one = One(one.fleet, one.folder, zooms=[1.0, 40.0])
+        one = One(one.fleet, one.folder, zooms=[40.0, 50.0])
         record = one.run()
         assert "camera gate (" in record.error
         assert "40" in record.error
         assert one.journal() == []  # found out before anything moves
+
+    def test_one_zoom_too_many_costs_no_other(self, one):
+        record = One(one.fleet, one.folder, zooms=[2.0, 40.0]).run()
+        assert record.error is None
+        assert record.zooms[0].error is None
+        assert "the lens has no 40x: it ends at 25x" in record.zooms[1].error
 
     def test_replies_slower_than_the_time_out(self, one):
         timing = one.config.timing.model_copy(update={"read_timeout_s": 0.05})
@@ -391,13 +398,27 @@ class TestNothingSeen:
 class FakeCamera:
     """Only keeps the calls; those named in `broken` raise. Nothing about it is to be learnt."""
 
-    name, identity, notes = "gate", "", ()
+    name, identity, notes, axes = "gate", "", (), None
+    zoom_curve = curve(25.0)
     capabilities = Capabilities(
         (-1, 1), (-1, 1), 0, 0, 0, 0, (0.0, 16384.0), 25.0, None, True, False
     )
 
+    zoom_range = (0.0, 16384.0)
+
     def __init__(self, broken=()):
         self.calls, self.broken = [], broken
+        self.at = Pose(0.5, 0.25, 20000.0)
+
+    def steps(self):
+        """The calls, but for the readings that a move is followed with."""
+        moved = False
+        kept = []
+        for call in self.calls:
+            if not (moved and call == ("position",)):
+                kept.append(call)
+            moved = moved or call[0] == "move"
+        return tuple(kept)
 
     def _call(self, name, *args):
         self.calls.append((name, *args))
@@ -412,7 +433,10 @@ class FakeCamera:
 
     def position(self):
         self._call("position")
-        return Pose(0.5, 0.25, 20000.0)
+        return self.at
+
+    def at_rest(self):
+        """It does not tell."""
 
     def prepare(self):
         self._call("prepare")
@@ -422,6 +446,7 @@ class FakeCamera:
 
     def move(self, pose):
         self._call("move", pose)
+        self.at = pose
 
     def restore(self):
         self._call("restore")
@@ -450,7 +475,7 @@ class TestPuttingBack:
         broken = {failing: error}
         camera, record = self.run(one, monkeypatch, broken)
         start = (("position",), ("prepare",), ("position",))
-        assert tuple(camera.calls) == (*start, *self.BACK)
+        assert camera.steps() == (*start, *self.BACK)
         # the error that ended the collection is told, the later ones are logged
         assert "cannot be reached" in record.error
         assert ("while putting it back" in caplog.text) == (failing is not None)
@@ -458,7 +483,7 @@ class TestPuttingBack:
     def test_a_camera_that_could_not_be_prepared(self, one, monkeypatch):
         error = ConnectionFailed("camera gate (host): was silent")
         camera, record = self.run(one, monkeypatch, {"prepare": error})
-        assert tuple(camera.calls) == (("position",), ("prepare",), *self.BACK)
+        assert camera.steps() == (("position",), ("prepare",), *self.BACK)
         assert record.error == str(error)
 
     def test_a_camera_whose_position_is_not_known_is_not_moved(self, one, monkeypatch):

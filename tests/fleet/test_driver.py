@@ -22,7 +22,7 @@ QUICK = {
     "zooms": [2.0],
     "scan": {"horizontal": 2, "vertical": 1, "points_per_line": 5, "tracks": 3},
 }
-PATIENT = {"settle_timeout_s": 0.5, "poll_interval_s": 0.002}
+PATIENT = {"settle_timeout_s": 0.5, "poll_interval_s": 0.002, "settle_s": 0.005}
 
 
 def faulty(**faults):

@@ -15,11 +15,11 @@ from torchptz.fleet.config import parse_config
 from torchptz.fleet.probe import probe
 from torchptz.fleet.probe_fleet import probe_fleet
 from torchptz.fleet.probe_mechanics import watch_motion
-from torchptz.fleet.stills import Stills
 from torchptz.scanning.observation import Stopped
+from torchptz.scanning.still_pictures import Stills
 
 QUICK = {
-    "timing": {"settle_timeout_s": 5.0, "poll_interval_s": 0.002},
+    "timing": {"settle_timeout_s": 5.0, "poll_interval_s": 0.002, "settle_s": 0.005},
     "device": {"focus_wait_s": 0.01},
 }
 PLAY = (0.05, 0.03)  # degrees
@@ -265,6 +265,15 @@ class TestFleet:
                 lambda *what: told.append(what),
             )
         assert told == []
+
+    def test_progress_that_raises_costs_nothing_but_the_reports(self, caplog):
+        def broken(*_):
+            raise BrokenPipeError("nobody listens")
+
+        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
+        reports = probe_fleet(parse_config({"cameras": [camera]}).cameras, progress=broken)
+        assert "cannot be reached" in reports["gate"].refused
+        assert caplog.text.count("its progress cannot be reported") == 1
 
     def test_a_report_that_cannot_be_stored_is_returned(self, tmp_path, caplog):
         camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}

@@ -9,7 +9,7 @@ import pytest
 
 from torchptz.cameras import Capabilities, MotionError, Pose
 from torchptz.cameras.sony.zoom import curve
-from torchptz.scanning import head_motion, observation
+from torchptz.scanning import head_motion, observation, still_pictures
 from torchptz.scanning.approach import FeatureNotFound, approach
 from torchptz.scanning.observation import Observer
 from torchptz.simulation import CameraConfig, SimulatedCamera
@@ -60,6 +60,8 @@ class InMemoryCamera:
             reads_position=True,
             reports_motion=False,
         )
+
+    axes = None
 
     def at_rest(self):
         return None
@@ -124,7 +126,7 @@ class Setup:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Time()
-    for module in (observation, head_motion):
+    for module in (observation, head_motion, still_pictures):
         monkeypatch.setattr(module, "time", clock)
     return clock
 

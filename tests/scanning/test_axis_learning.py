@@ -1,6 +1,7 @@
 """Learning of axes, on simulated lenses with distortion, roll and noise whose truth is known."""
 
 import math
+from dataclasses import replace
 from math import degrees, radians
 
 import cv2
@@ -78,13 +79,28 @@ class TestSigns:
         ],
         ids=["as said", "pan reversed", "mirrored", "turned by 180", "turned and reversed"],
     )
-    def test_are_learnt_with_three_looks(self, settings, signs):
+    def test_are_learnt_with_six_looks(self, settings, signs):
         head = Head(**settings)
         report = head.learn(head.axes())
         assert report.seen
         assert (np.sign(report.axes.pan.scale), np.sign(report.axes.tilt.scale)) == signs
         assert report.axes.signs_known
-        assert len(head.poses) == 3
+        # one that goes nowhere, three for the signs, two for the scales
+        assert len(head.poses) == 6
+
+    @pytest.mark.parametrize("known", ["pan", "tilt"])
+    def test_one_that_is_configured_is_refused_and_the_other_one_learnt(self, known):
+        head = Head(scale=(-1, 1) if known == "tilt" else (1, -1))
+        believed = head.axes()
+        either = {"pan": believed.pan, "tilt": believed.tilt}
+        believed = HeadAxes(**{**either, known: replace(either[known], sign_known=True)})
+        learnt = head.learn(believed).axes
+        assert learnt.signs_known
+        other = "pan" if known == "tilt" else "tilt"
+        assert getattr(learnt, known).scale > 0 > getattr(learnt, other).scale
+        wrong = Head(scale=(-1, -1))
+        with pytest.raises(MotionError, match=f"against the {known} axis; set {known}_sign"):
+            wrong.learn(believed)
 
     def test_configured_ones_are_refused_where_pictures_contradict(self):
         head = Head(picture=mirrored)
@@ -147,7 +163,7 @@ class TestScales:
     @staticmethod
     def _learnt(head, zero):
         report = head.learn(head.axes(0.3, 10))
-        assert report.scales_learnt, report.notes
+        assert report.fit is not None, report.notes
         tilt = report.axes.tilt
         assert abs(degrees(tilt.offset) - zero) < 3 * degrees(tilt.offset_sigma) < 1.5
         return report.axes.pan, tilt
@@ -161,7 +177,7 @@ class TestScales:
         head = Head(6)
         axes = head.axes(0.0, 5)
         learnt = head.learn(axes).axes
-        assert learnt.pan == axes.pan
+        assert learnt.pan == replace(axes.pan, sign_known=True)
         assert learnt.tilt.scale == axes.tilt.scale
         assert abs(learnt.tilt.offset) < 3 * learnt.tilt.offset_sigma < radians(2)
 
@@ -173,10 +189,55 @@ class TestScales:
         assert learnt.circular
         assert learnt.scale == pan.scale
 
-    def test_an_exact_scale_that_the_field_of_view_contradicts_is_noted(self):
-        head = Head(scale=(0.5, 1.0))
-        (note,) = head.learn(head.axes()).notes
-        assert note.startswith("pan moves the picture 0.5")
+
+class TestExactOnes:
+    """Axes that are said to count degrees from the level."""
+
+    @pytest.mark.parametrize("scale", [(1.03, 1.0), (1.0, 0.97), (0.5, 1.6)])
+    def test_are_learnt_where_pictures_contradict(self, scale):
+        head = Head(8, scale)
+        report = head.learn(head.axes())
+        wrong = [i for i, one in enumerate(scale) if one != 1]
+        assert len(report.notes) == len(wrong)
+        assert all(note.startswith("its degrees are not degrees") for note in report.notes)
+        for index, axis in enumerate((report.axes.pan, report.axes.tilt)):
+            if index in wrong:
+                assert abs(degrees(axis.scale) / scale[index] - 1) < 3 * axis.scale_sigma < 0.03
+            else:
+                assert (axis.scale, axis.scale_sigma) == (radians(1), 0.0)
+        assert report.axes.tilt.offset_sigma == 0
+
+    def test_so_is_a_zero(self):
+        head = Head(8, (1.0, 1.0), -8.0)
+        report = head.learn(head.axes())
+        (note,) = report.notes
+        assert "its tilt does not count from the level: -8.0 deg" in note
+        tilt = report.axes.tilt
+        assert abs(degrees(tilt.offset) + 8) < 3 * degrees(tilt.offset_sigma) < 1.5
+        assert tilt.scale_sigma == 0
+
+    @pytest.mark.parametrize("seed", range(4))
+    def test_are_believed_where_they_are_right(self, seed):
+        head = Head(seed, quantum=0.1, lens={"barrel_wide": 0.12}, head={"roll_deg": 1.0})
+        axes = head.axes()
+        report = head.learn(axes, at=(20, (-10, 5, 30, 60)[seed]))
+        assert report.notes == ()
+        assert report.axes == HeadAxes(axes.pan, axes.tilt, signs_known=True)
+        assert max(report.fit.pan_sigma, report.fit.tilt_sigma) < 0.01
+
+    def test_where_pictures_cannot_tell_a_note_says_so(self):
+        head = Head(8, (1.03, 1.0))
+        far = radians(30)
+
+        def look(pose):
+            frame, reading = head.look(pose)
+            return (np.full_like(frame, 90) if pose.tilt > far else frame), reading
+
+        report = learn_axes(look, head.axes(), Pose(0.3, 0.1, 0.0), FOV, name="gate")
+        assert report.seen
+        assert report.fit is None
+        (note,) = report.notes
+        assert note.startswith("whether its degrees are degrees could not be checked")
 
 
 def test_looks_stay_within_the_limits_of_the_axes():

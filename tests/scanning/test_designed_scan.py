@@ -356,7 +356,11 @@ def simulated(tmp_path):
                         "zooms": [1.0, 6.0],
                         "head": {"pupil_sigma_m": 0.002},
                         "scan": {"tracks": 4, "design": "optimal", "target_sigma_px": 1.0},
-                        "timing": {"settle_timeout_s": 5.0, "poll_interval_s": 0.002},
+                        "timing": {
+                            "settle_timeout_s": 5.0,
+                            "poll_interval_s": 0.002,
+                            "settle_s": 0.005,
+                        },
                     }
                 ]
             },

@@ -52,22 +52,36 @@ def motion(camera, overshoot=OVERSHOOT):
     return HeadMotion(camera, threading.Event(), 5.0, 0.05, overshoot)
 
 
+def arrive(head, pose):
+    """Go to a pose so that both axes arrive upwards."""
+    via = head.way_to(pose)
+    if via is not None:
+        head.go(via)
+    return head.go(pose)
+
+
 class TestWay:
     def test_an_axis_that_would_arrive_downwards_goes_beyond_first(self, clock):
         head = motion(Head())
-        head.go(Pose(0.5, 0.2, 0.0))
+        arrive(head, Pose(0.5, 0.2, 0.0))
         assert head.way_to(Pose(0.4, 0.3, 0.0)) == Pose(0.4 - OVERSHOOT, 0.3, 0.0)
         assert head.way_to(Pose(0.6, 0.1, 0.0)) == Pose(0.6, 0.1 - OVERSHOOT, 0.0)
 
     def test_upwards_it_goes_straight(self, clock):
         head = motion(Head())
-        head.go(Pose(0.5, 0.2, 0.0))
+        arrive(head, Pose(0.5, 0.2, 0.0))
         assert head.way_to(Pose(0.6, 0.2, 0.0)) is None
 
-    def test_nobody_knows_from_where_a_head_came_first(self):
-        assert motion(Head()).way_to(Pose(0.5, 0.2, 3.0)) == Pose(
-            0.5 - OVERSHOOT, 0.2 - OVERSHOOT, 3.0
-        )
+    def test_a_short_way_up_does_not_take_up_the_play(self, clock):
+        camera = Head()
+        camera.pose = Pose(0.5, 0.2, 0.0)  # nobody knows from where it came there
+        head = motion(camera)
+        short, far = Pose(0.5 + OVERSHOOT / 2, 0.2, 3.0), Pose(0.5 + 2 * OVERSHOOT, 0.3, 3.0)
+        assert head.way_to(short) == Pose(short.pan - OVERSHOOT, 0.2 - OVERSHOOT, 3.0)
+        assert head.way_to(far) is None
+        head.go(far)
+        onwards = replace(far, pan=far.pan + OVERSHOOT / 4)
+        assert head.way_to(onwards) is None
 
     def test_at_its_lower_limit_it_stays_within(self, clock):
         head = motion(Head())
@@ -78,7 +92,7 @@ class TestWay:
     def test_on_a_circle_the_short_way_counts(self, clock):
         circle = capabilities(**FINE, pan_limits=(-math.pi, math.pi), pan_circular=True)
         head = motion(Head(circle))
-        head.go(Pose(3.1, 0.2, 0.0))
+        arrive(head, Pose(3.1, 0.2, 0.0))
         assert head.way_to(Pose(-3.1, 0.2, 0.0)) is None  # 0.08 rad upwards over the seam
         head.go(Pose(-3.1, 0.2, 0.0))
         assert head.way_to(Pose(3.14, 0.2, 0.0)).pan == pytest.approx(3.14 - OVERSHOOT)
@@ -88,8 +102,27 @@ class TestWay:
 
     def test_less_than_the_grid_of_the_head_is_no_move(self, clock):
         head = motion(Head(capabilities()))
-        at = head.go(Pose(0.5, 0.2, 0.0))
+        at = arrive(head, Pose(0.5, 0.2, 0.0))
         assert head.way_to(replace(at, pan=at.pan - 1e-4)) is None
+
+    @pytest.mark.parametrize("moved", [0.1, -0.1])
+    def test_after_somebody_else_moved_it_the_side_is_not_known(self, clock, moved):
+        head = motion(Head())
+        pose = Pose(0.5, 0.2, 0.0)
+        arrive(head, pose)
+        assert head.way_to(pose) is None
+        head.camera.pose = replace(pose, pan=0.5 + moved)
+        via = head.way_to(pose)
+        assert via == (None if moved < 0 else Pose(0.5 - OVERSHOOT, 0.2, 0.0))
+        # where somebody else left it, nobody knows how it came there
+        head.camera.pose = elsewhere = replace(pose, tilt=0.19)
+        assert head.way_to(elsewhere).tilt == pytest.approx(0.19 - OVERSHOOT)
+
+    def test_one_that_came_directly_is_no_arrival_upwards(self, clock):
+        head = motion(Head())
+        arrive(head, Pose(0.5, 0.2, 0.0))
+        head.go(Pose(0.4, 0.2, 0.0))
+        assert head.way_to(Pose(0.4, 0.2, 0.0)) == Pose(0.4 - OVERSHOOT, 0.2, 0.0)
 
 
 class TestCommands:
@@ -137,6 +170,15 @@ class TestBeside:
         began = clock.now
         head.go(Pose(20 * camera.step, 0.2, 0.0))
         assert clock.now - began > 0.5
+
+
+class TestTime:
+    def test_a_camera_that_is_not_finished_in_time_is_given_up(self, clock):
+        head = HeadMotion(Head(), threading.Event(), 5.0, 0.05, deadline=clock.now + 1.0)
+        head.go(Pose(0.5, 0.2, 0.0))
+        clock.now += 1.1
+        with pytest.raises(MotionError, match=r"camera fake: .*timing\.longest_s"):
+            head.go(Pose(0.6, 0.2, 0.0))
 
 
 class TestFlag:

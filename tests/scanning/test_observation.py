@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from torchptz.cameras import BadPicture, Capabilities, MotionError, Pose
-from torchptz.scanning import head_motion
+from torchptz.scanning import head_motion, still_pictures
 from torchptz.scanning import observation as module
 from torchptz.scanning.observation import Observer, Stopped
 
@@ -52,6 +52,8 @@ class FakeCamera:
         reads_position=True,
         reports_motion=False,
     )
+
+    axes = None
 
     def at_rest(self):
         return None
@@ -112,6 +114,7 @@ class FakeCamera:
             x += self.swing(self.pictures)
             cover = np.clip(7.5 - np.hypot(columns - x, rows - y), 0, 1)
             frame = frame + cover * (235 - frame)
+        frame[0, self.pictures % 160] += 1  # no two pictures of a sensor are the same
         self.after_picture(self.pictures)
         return np.repeat(np.rint(frame).astype(np.uint8)[..., None], 3, -1)
 
@@ -141,6 +144,7 @@ def clock(monkeypatch):
     clock = Time()
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(head_motion, "time", clock)
+    monkeypatch.setattr(still_pictures, "time", clock)
     return clock
 
 
@@ -149,7 +153,9 @@ class Setup:
         self.clock = clock
         self.camera = FakeCamera(clock, *args, **options)
         self.recorded, self.stop = [], threading.Event()
-        self.observer = Observer(self.camera, self.recorded.append, self.stop, timeout, POLL_S)
+        self.observer = Observer(
+            self.camera, self.recorded.append, self.stop, timeout, POLL_S, settle_s=0.02
+        )
 
     def look(self, pose=THERE, **options):
         return self.observer.look(pose, "line", **options)
@@ -404,9 +410,10 @@ class TestErrors:
     def test_a_picture_that_swings_on(self, clock):
         setup = Setup(clock)
         setup.camera.swing = lambda number: 3.0 * (-1) ** number
+        started = clock.now
         with pytest.raises(MotionError, match=r"camera gate: .*did not come to rest.*stabiliser"):
             setup.look()
-        assert setup.camera.pictures == 12
+        assert setup.clock.now - started < 25.0  # settle_timeout_s, once for readings, once more
         assert setup.recorded == []
 
     def test_errors_of_the_camera_pass_as_they_are(self, clock):

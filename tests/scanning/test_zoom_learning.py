@@ -1,5 +1,7 @@
 """Learning of the zoom, on simulated lenses: the curve, its ends, and what is no lens at all."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -29,15 +31,58 @@ class Zoom:
             frame = cv2.imdecode(coded, cv2.IMREAD_COLOR)
         return frame, pose
 
-    def learn(self, limits=(0, OPTICAL_UNITS), said=None):
+    def learn(self, limits=(0, OPTICAL_UNITS), said=None, quantum=0.0):
         at = Pose(0.3, 0.2, limits[0])
-        return learn_zoom(self, limits, at, max_magnification=said, name="gate")
+        return learn_zoom(self, limits, at, quantum=quantum, max_magnification=said, name="gate")
 
     def truth(self, curve):
         optics = self.camera.optics
         return (
             np.array([optics.at(self.units(u)).focal_length for u in curve.units]) / optics.f_wide
         )
+
+
+class Restless(Zoom):
+    """Its pictures do not come to rest beyond some units."""
+
+    def __init__(self, beyond):
+        super().__init__()
+        self.beyond = beyond
+
+    def __call__(self, pose):
+        if pose.zoom > self.beyond:
+            raise MotionError("camera gate: no rest here")
+        return super().__call__(pose)
+
+
+class Beside(Zoom):
+    """Its readings lie beside what was commanded."""
+
+    def __call__(self, pose):
+        frame, pose = super().__call__(pose)
+        return frame, replace(pose, zoom=pose.zoom + 3)
+
+
+class TestUnits:
+    def test_are_those_that_are_commanded(self):
+        curve = Beside().learn().curve
+        assert curve.limits == (0, OPTICAL_UNITS)
+        off = np.array(curve.magnifications) / Zoom().truth(curve) - 1
+        assert np.abs(off).max() < 0.05
+
+    def test_of_a_coarse_zoom_are_on_its_grid(self):
+        zoom = Zoom(lambda commanded: OPTICAL_UNITS * commanded)
+        curve = zoom.learn((0.0, 1.0), quantum=0.04).curve
+        assert curve.limits == (0.0, 1.0)
+        steps = np.array(curve.units) / 0.04
+        assert np.abs(steps - np.rint(steps)).max() < 1e-9
+
+    @pytest.mark.parametrize(("late", "begins"), [(0.004, True), (0.2, False)])
+    def test_a_dead_beginning_is_more_than_a_late_one(self, late, begins):
+        zoom = Zoom(lambda commanded: OPTICAL_UNITS * max(commanded - late, 0) / (1 - late))
+        report = zoom.learn((0.0, 1.0))
+        assert (report.curve.limits[0] == 0) is begins
+        assert bool(report.dead) is not begins
 
 
 class TestCurve:
@@ -72,6 +117,12 @@ class TestCurve:
         assert report.dead
         assert report.dead[-1][1] == OPTICAL_UNITS
 
+    def test_a_long_end_where_nothing_rests_is_guessed(self):
+        report = Restless(12000).learn(said=20.0)
+        assert report.curve.limits[1] == OPTICAL_UNITS
+        assert "units of zoom: camera gate: no rest here" in report.notes[0]
+        assert "it is guessed" in report.notes[1]
+
     def test_of_pictures_without_texture_nothing_is_learnt(self):
         report = Zoom(scene={"plain_background": 90.0}).learn()
         assert report.curve is None
@@ -93,6 +144,10 @@ class TestRefused:
         zoom = Zoom(lambda commanded: commanded if commanded < 9000 else commanded - 7000)
         with pytest.raises(MotionError, match="the zoom falls back"):
             zoom.learn()
+
+    def test_one_that_rests_nowhere(self):
+        with pytest.raises(MotionError, match="no rest here"):
+            Restless(0).learn()
 
 
 class TestDigital:

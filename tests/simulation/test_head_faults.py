@@ -65,6 +65,13 @@ class TestTruthLeavesTheReading:
         truths = [gone_to(head, clock, pan)[1][0] for pan in (1.0, 1.01, 1.02, 1.01, 1.0)]
         assert np.diff(truths) == pytest.approx([0.01, 0.01, -0.018, -0.01])
 
+    def test_units_larger_than_the_dialect_says(self, clock):
+        head = make(clock, tilt_units_per_deg=100, tilt_zero_deg=0.5)
+        head.set_faults(FaultConfig(units_off_percent=3))
+        reading, truth = gone_to(head, clock, -20, 10)
+        assert reading == pytest.approx((-20, 10))
+        assert truth == pytest.approx((-20.6, 10.8))
+
     @pytest.mark.parametrize("axis", ["pan", "tilt"])
     def test_reversed_axis_turns_the_other_way_than_it_reads(self, clock, axis):
         head = make(clock, tilt_units_per_deg=100)
@@ -100,6 +107,21 @@ class TestArrival:
         assert widest[0] < 0.05
         assert 0.5 < widest[1] < 1.55
 
+    @pytest.mark.parametrize("speed_up", [1, 100])
+    def test_overshoot_is_met_20_ms_after_arrival_however_fast_the_head(self, clock, speed_up):
+        head = make(clock, speed_up=speed_up, acceleration_deg=1e6)
+        head.set_faults(FaultConfig(overshoot_deg=0.5))
+        head.move_to(radians(30), 0.0, radians(300), 1.0)
+        clock.advance(0.101 / speed_up)
+        assert degrees(head.reading().pan) == pytest.approx(30)
+        off = []
+        for _ in range(21):
+            clock.advance(0.02)
+            off.append(abs(degrees(head.true_pose().pan) - 30))
+        assert off[0] > 0.2
+        assert off[-1] == pytest.approx(0, abs=1e-9)
+        assert not head.moving()
+
     def test_coasts_beyond_the_target_and_says_so(self, clock):
         head = make(clock)
         head.set_faults(FaultConfig(coast_deg=2.0))
@@ -122,6 +144,69 @@ class TestArrival:
         head.stop()
         clock.advance(9.0)
         assert degrees(head.reading().pan) - before == pytest.approx(2.0, abs=0.02)
+
+
+class TestZoom:
+    def zoomed_to(self, head, clock, units):
+        """Reading and truth."""
+        head.zoom_to(units)
+        clock.advance(60.0)
+        return head.reading().zoom_units, head.true_pose().zoom_units
+
+    def test_stops_short_when_it_comes_from_the_long_end(self, clock):
+        head = make(clock)
+        head.set_faults(FaultConfig(zoom_backlash_units=20))
+        assert self.zoomed_to(head, clock, 8000) == (8000, 8000)
+        reading, truth = self.zoomed_to(head, clock, 5000)
+        assert reading == 5000
+        assert 5010 <= truth <= 5020
+        assert self.zoomed_to(head, clock, 5000) == (reading, truth)
+        assert self.zoomed_to(head, clock, 6000) == (6000, 6000)
+        self.zoomed_to(head, clock, 5000)
+        head.set_faults(FaultConfig())
+        assert head.true_pose().zoom_units == 5000
+
+    def test_truth_does_not_leap_on_the_way(self, clock):
+        head = make(clock)
+        head.set_faults(FaultConfig(zoom_backlash_units=200))
+        self.zoomed_to(head, clock, 8000)
+        self.zoomed_to(head, clock, 6000)
+        head.zoom_to(4000)
+        passed = [head.true_pose().zoom_units]
+        for _ in range(600):
+            clock.advance(0.001)
+            passed.append(head.true_pose().zoom_units)
+        assert np.all(np.diff(passed) <= 0)
+        assert np.abs(np.diff(passed)).max() < 8
+
+
+class TestLateCommands:
+    @pytest.mark.parametrize("speed_up", [1, 50])
+    def test_begin_later_by_the_walls_clock(self, clock, speed_up):
+        head = make(clock, speed_up=speed_up)
+        head.set_faults(FaultConfig(command_delay_s=0.2))
+        head.move_to(radians(20), 0.0, *FAST)
+        head.zoom_to(3000)
+        clock.advance(0.199)
+        assert head.reading() == (0, 0, 0)
+        assert not head.motors_run()  # so much a device can claim
+        assert head.moving()
+        clock.advance(0.031)
+        assert head.reading().pan > 0
+        clock.advance(5.0)
+        assert degrees(head.reading().pan) == pytest.approx(20)
+        assert head.reading().zoom_units == 3000
+
+    def test_a_move_goes_on_until_the_next_command_is_obeyed(self, clock):
+        head = make(clock, acceleration_deg=1e6)
+        head.set_faults(FaultConfig(command_delay_s=0.2))
+        head.move_to(radians(100), 0.0, radians(50), 1.0)
+        clock.advance(1.2)
+        head.stop()
+        clock.advance(0.1)
+        assert degrees(head.reading().pan) == pytest.approx(55, abs=0.1)
+        clock.advance(1.0)
+        assert degrees(head.reading().pan) == pytest.approx(60, abs=0.1)
 
 
 class TestByItself:

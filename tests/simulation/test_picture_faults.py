@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from torchptz.simulation import CameraTruth
+from torchptz.simulation.focus import DEPTH, sharp_at
 from torchptz.simulation.view import HeadPose
 
 POSE, WIDE = HeadPose(0.3, 0.1, 4000.0), HeadPose(0.3, 0.1, 0.0)
@@ -41,6 +42,38 @@ class TestLens:
         assert min(map(sharpness, frames)) < 0.75 * sharpness(plain)
         camera.focus.auto = False
         assert all((camera.render(WIDE, 0, m) == plain).all() for m in (0.1, 0.7))
+
+    def test_locked_far_from_sharp_it_blurs_and_moves_nothing(self, make_camera):
+        ball = {"pan_deg": 20, "tilt_deg": 6}
+        camera = make_camera(scene={"ball": ball, "plain_background": 40})
+        pose = HeadPose(radians(20.4), radians(6.3), 9000.0)
+        sharp = camera.render(pose)
+        camera.focus.auto = False
+        positions = (sharp_at(9000), 0, 9999)
+        frames = [camera.render(pose) for camera.focus.position in positions]
+        assert (frames[0] == sharp).all()
+        edges = [sharpness(frame) for frame in frames]
+        assert edges[0] > 1.1 * edges[1] > 1.3 * edges[2]
+        light = [frame.astype(float).sum(2) - 120 for frame in frames]
+        y, x = np.mgrid[: light[0].shape[0], : light[0].shape[1]]
+        centres = [((one * x).sum() / one.sum(), (one * y).sum() / one.sum()) for one in light]
+        assert np.ptp(centres, axis=0).max() < 0.05
+
+    def test_automatic_it_follows_the_zoom_and_locked_it_stays(self, make_camera, clock):
+        camera = make_camera()
+        wide = camera.focus.position
+        camera.zoom_to(12000)
+        clock.advance(9)
+        tele = camera.focus.position
+        assert tele > wide + DEPTH
+        camera.focus.auto = False
+        camera.zoom_to(0)
+        clock.advance(9)
+        assert camera.focus.position == tele
+        assert camera.focus.blur_px(0.0, 736) > 0.1
+        camera.focus.once()
+        assert camera.focus.position == wide
+        assert camera.focus.blur_px(0.0, 736) == 0
 
     def test_one_autofocus_comes_to_an_end(self, make_camera, clock):
         camera = make_camera()
@@ -188,6 +221,23 @@ class TestSays:
         assert camera.reading().pan == pytest.approx(0.5, abs=1e-3)
         camera.set_faults(no_position=True)
         assert camera.reading() is None
+
+    @pytest.mark.parametrize("dialect", ["sony_rz30", "axis", "hikvision"])
+    def test_zoom_reads_so_many_of_its_own_units_more(self, make_camera, clock, dialect):
+        camera = make_camera(dialect=dialect)
+        camera.zoom_to(8000)
+        clock.advance(60)
+        before = camera.zoom_scale.to_device(camera.reading().zoom_units)
+        camera.set_faults(zoom_reading_offset_units=1)
+        assert camera.head.true_pose().zoom_units == 8000
+        after = camera.zoom_scale.to_device(camera.reading().zoom_units)
+        assert after - before == pytest.approx(1)
+
+    def test_zoom_reads_beyond_its_end(self, make_camera, clock):
+        camera = make_camera(faults={"zoom_reading_offset_units": 1})
+        camera.zoom_to(16384)
+        clock.advance(60)
+        assert camera.reading().zoom_units == 16385
 
     @pytest.mark.parametrize(("pan", "told"), [(-30, 30), (30, 330), (0, 0)])
     def test_pan_from_0_to_360_to_the_right(self, make_camera, clock, pan, told):

@@ -1,4 +1,4 @@
-"""Drivers for pan-tilt-zoom cameras over HTTP: one dialect a file, one factory for all."""
+"""Drivers for pan-tilt-zoom cameras over HTTP: a folder for each make, one factory for all."""
 
 import importlib
 import inspect

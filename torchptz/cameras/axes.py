@@ -29,6 +29,7 @@ class Axis:
     circular: bool = False  # a full turn leads back: its limits are one turn apart
     scale_sigma: float = 0.0  # relative
     offset_sigma: float = 0.0  # rad
+    sign_known: bool = False  # its sense: by the configuration, or by pictures
 
     def __post_init__(self) -> None:
         if not (self.scale and math.isfinite(self.scale) and math.isfinite(self.offset)):
@@ -76,11 +77,34 @@ class Axis:
         """The axis as it is where mount or picture turn it round; its zero stays where it is."""
         return replace(self, scale=-self.scale, offset=-self.offset)
 
+    def believing(self, learnt: Axis) -> Axis:
+        """The axis with another one's scale, zero and sense, and with how well these are known;
+        steps and limits stay, which the device told meanwhile."""
+        return replace(
+            self,
+            scale=learnt.scale,
+            offset=learnt.offset,
+            circular=learnt.circular,
+            scale_sigma=learnt.scale_sigma,
+            offset_sigma=learnt.offset_sigma,
+            sign_known=learnt.sign_known,
+        )
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, init=False)
 class HeadAxes:
-    """Pan and tilt of one head, and whether their senses are to be believed."""
+    """Pan and tilt of one head."""
 
     pan: Axis
     tilt: Axis
-    signs_known: bool = False  # by the configuration; else pictures tell
+
+    def __init__(self, pan: Axis, tilt: Axis, signs_known: bool | None = None) -> None:
+        if signs_known is not None:
+            pan, tilt = (replace(one, sign_known=signs_known) for one in (pan, tilt))
+        object.__setattr__(self, "pan", pan)
+        object.__setattr__(self, "tilt", tilt)
+
+    @property
+    def signs_known(self) -> bool:
+        """Whether the senses of both are to be believed."""
+        return self.pan.sign_known and self.tilt.sign_known

@@ -162,6 +162,11 @@ class Camera(Protocol):
     def close(self) -> None:
         """Release the connection; the camera cannot be used afterwards."""
 
+    @property
+    def zoom_range(self) -> tuple[float, float]:
+        """Device units, all that move() takes: more than the optical range, or than what is known
+        of it, for a lens is put back to where it was found."""
+
     def zoom_units(self, magnification: float) -> float:
         """Device units for a magnification (1 = widest), from a nominal table."""
 

@@ -19,6 +19,7 @@ logger = logging.getLogger(__name__)
 
 # Nearer to straight down (or up) the head flips over and a pan only turns the picture.
 _STEEPEST_TILT = math.radians(85)
+_ARRIVED = 0.003  # of the zoom's range: lenses stop so near to where they were sent
 
 
 class Driver(ABC):
@@ -31,7 +32,14 @@ class Driver(ABC):
     reports_motion = False  # a dialect's reply to position() tells whether the head moves
     zoom_step = 1.0  # device units, the smallest step of the zoom; 0: continuous
 
-    def __init__(self, name: str, transport: CameraTransport) -> None:
+    def __init__(
+        self,
+        name: str,
+        transport: CameraTransport,
+        signs: tuple[int | None, int | None] = (None, None),
+    ) -> None:
+        """signs: of pan and tilt, as configured: see `signed`. Raises ValueError for others."""
+        check_signs(name, *signs)
         self.name = name
         self.identity = ""  # model, serial, firmware, as the device says; for reports
         self.notes: list[str] = []  # what about the device a user should know, and what to do
@@ -40,6 +48,8 @@ class Driver(ABC):
         self.horizontal_fov: float | None = None  # rad, at the widest zoom
         self.reported_moving: bool | None = None  # what the last position() said; None: nothing
         self._transport = transport
+        self._signs = signs
+        self._whole_zoom: tuple[float, float] | None = None  # device units; None: the curve's
         self._margin = 0.0  # rad
         self._most = math.inf  # magnification
         self._undo: list[tuple[str, Callable[[], None]]] = []
@@ -119,9 +129,22 @@ class Driver(ABC):
         self._margin, self._most = margin, max_magnification
 
     def learn(self, axes: HeadAxes | None = None, zoom: ZoomCurve | None = None) -> None:
-        """Take what pictures told of axes or zoom in place of what was believed."""
-        self.axes = axes or self.axes
+        """Take what pictures told of axes or zoom in place of what was believed.
+
+        Of axes that is scale, zero and sense: steps and limits are the device's own matter.
+        """
+        now, self._whole_zoom = self._known()[0], self.zoom_range
+        if axes is not None:
+            self.axes = HeadAxes(now.pan.believing(axes.pan), now.tilt.believing(axes.tilt))
         self.zoom_curve = zoom or self.zoom_curve
+
+    @property
+    def zoom_range(self) -> tuple[float, float]:
+        """Device units, all that move() takes: also what lies beyond a learnt curve, or beyond
+        the optical end where the device goes there too. To put a lens back, not to measure."""
+        curve = self._known()[1]
+        low, high = self._whole_zoom or curve.limits
+        return min(low, curve.limits[0]), max(high, curve.limits[1])
 
     def zoom_units(self, magnification: float) -> float:
         """Device units for a magnification, 1 = widest, on the grid of the device's zoom. Raises
@@ -134,10 +157,16 @@ class Driver(ABC):
             raise self._transport.error(MotionError, f"has {error}", way_out) from error
 
     def magnification(self, zoom_units: float) -> float:
-        """Magnification at device units; the inverse of zoom_units(), with its errors."""
+        """Magnification at device units, the inverse of zoom_units(), with its errors; a reading
+        that is so little beyond an end that the lens counts as arrived there, is the end."""
         curve = self._known()[1]
+        low, high = curve.limits
+        slack = _ARRIVED * (high - low)
+        inside = min(max(zoom_units, low), high)
         try:
-            return curve.magnification_of(zoom_units)
+            return curve.magnification_of(
+                inside if abs(zoom_units - inside) <= slack else zoom_units
+            )
         except ValueError as error:
             way_out = "stay within {:g} to {:g}, and switch digital zoom off".format(*curve.limits)
             raise self._transport.error(MotionError, f"has {error}", way_out) from error
@@ -164,6 +193,11 @@ class Driver(ABC):
 
     # ---- for dialects
 
+    def note(self, text: str) -> None:
+        """Tell the user something, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
     def remember(self, what: str, undo: Callable[[], None]) -> None:
         """Note how to undo a change, before it is made. Of one ``what`` the first note stays, so
         that prepare() may be called again, as after an error."""
@@ -175,7 +209,7 @@ class Driver(ABC):
 
         Raises MotionError, before anything is sent, for a pose beyond the device's own limits.
         """
-        axes, curve = self._known()
+        axes = self._known()[0]
         pan, tilt = axes.pan.on_grid(pose.pan), axes.tilt.on_grid(pose.tilt)
         for what, units, axis, angle in (
             ("pan", pan, axes.pan, pose.pan),
@@ -188,7 +222,7 @@ class Driver(ABC):
                     f"cannot go to {what} {math.degrees(angle):.3f} deg",
                     f"ask for {low:g} to {high:g} deg",
                 )
-        low, high = curve.limits
+        low, high = self.zoom_range
         slack = 1e-4 * (high - low)
         if not low - slack <= pose.zoom <= high + slack:
             raise self._transport.error(
@@ -220,13 +254,24 @@ class Driver(ABC):
 
 
 def signed(axes: HeadAxes, pan_sign: int | None, tilt_sign: int | None) -> HeadAxes:
-    """Axes with their senses as configured; None leaves one to the pictures.
+    """Axes with their senses as configured; None leaves one to the pictures."""
+    pan, tilt = (
+        replace(axis.reversed() if sign == -1 else axis, sign_known=sign is not None)
+        for axis, sign in ((axes.pan, pan_sign), (axes.tilt, tilt_sign))
+    )
+    return HeadAxes(pan, tilt)
 
-    Only where both are given they are taken as known. Raises ValueError for another sign.
-    """
-    for name, sign in (("pan_sign", pan_sign), ("tilt_sign", tilt_sign)):
+
+def check_signs(name: str, pan_sign: int | None, tilt_sign: int | None) -> None:
+    """Raises ValueError, naming the camera, for a sign that is none."""
+    for option, sign in (("pan_sign", pan_sign), ("tilt_sign", tilt_sign)):
         if sign not in (None, 1, -1) or isinstance(sign, bool):
-            raise ValueError(f"{name} must be 1, -1 or None, not {sign!r}")
-    pan = axes.pan.reversed() if pan_sign == -1 else axes.pan
-    tilt = axes.tilt.reversed() if tilt_sign == -1 else axes.tilt
-    return replace(axes, pan=pan, tilt=tilt, signs_known=None not in (pan_sign, tilt_sign))
+            raise ValueError(f"camera {name}: {option} must be 1, -1 or None, not {sign!r}")
+
+
+def check_options(name: str, *options: tuple[str, object, bool]) -> None:
+    """Raises ValueError, naming the camera, for the first option (name, value, whether it is
+    good) that is not good."""
+    for option, value, good in options:
+        if not good:
+            raise ValueError(f"camera {name}: {option} cannot be {value!r}")

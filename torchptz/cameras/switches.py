@@ -22,9 +22,7 @@ def switch(
         change()
     except ProtocolError as error:
         logger.debug("%s (taken for a switch that it does not have)", error)
-        note = f"its {what} cannot be switched from here: {by_hand}"
-        if note not in driver.notes:
-            driver.notes.append(note)
+        driver.note(f"its {what} cannot be switched from here: {by_hand}")
         return False
     except AuthenticationError:
         raise  # nothing arrived, and nothing will

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.designed import DesignedCollection
 from torchptz.fleet.journal import Journal
 from torchptz.fleet.probe import probe
+from torchptz.fleet.putting_back import put_back
 from torchptz.fleet.records import CameraRecord, ZoomRecord, save_patterns
 from torchptz.fleet.reference import ReferencePose
 from torchptz.fleet.survey import Survey
@@ -33,6 +35,7 @@ _EXPECTED = (CameraError, ValueError, OSError, Stopped)  # by those who wrote th
 # would be a few steps long, and the feature would be sought all over the picture.
 _COARSEST_STEP = 0.05
 _LEAST_REACH = 1.5  # magnification; a lens whose zoom tracks are shorter shows no principal point
+_ROUNDING = 1 + 1e-6  # of a longest zoom that was given as such
 _MARGIN = math.radians(2)  # from the head's stops, where open-loop heads lose their zero
 _USUAL_FOV = math.radians(55)  # at the wide end, of a device that does not say
 _WIDEST_OVERSCAN = 1.08  # of the undistorted picture over the real one, before anything is seen
@@ -61,6 +64,7 @@ class Collector:
         self._stop = stop
         self._progress = progress
         self._image_size = (0, 0)
+        self._deadline = math.inf
 
     def run(self) -> CameraRecord:
         """Collect all zoom levels.
@@ -83,6 +87,7 @@ class Collector:
             # The record of an earlier run must not pass for this one's, whatever happens now.
             record.save(self._folder)
             journal = Journal(self._folder)
+            self._deadline = time.monotonic() + config.timing.longest_s
             self._tell("connecting", 0, 1)
             camera = open_camera(
                 config.dialect,
@@ -93,8 +98,9 @@ class Collector:
             )
             camera.connect()
             record.identity = camera.identity or None
-            for zoom in config.zooms:
-                camera.zoom_units(zoom)  # what the lens does not have is told before it moves
+            if camera.zoom_curve.known:
+                # That the lens has none of the zooms is told before anything moves.
+                camera.zoom_units(config.zooms[0])
             start = camera.position()
             camera.prepare()
             start = self._probe(camera, start, record)
@@ -107,7 +113,9 @@ class Collector:
             record.error = self._reason(error)
         finally:
             if camera is not None:
-                _put_back(camera, start)
+                left = put_back(camera, start, config.timing)
+                if left:
+                    record.notes.append(f"it could not be put back: {'; '.join(left)}")
             try:
                 if journal is not None:
                     journal.close()
@@ -130,6 +138,8 @@ class Collector:
             timing.settle_timeout_s,
             timing.poll_interval_s,
             overshoot,
+            timing.settle_s,
+            self._deadline,
         )
         frame = camera.snapshot()
         self._image_size = record.image_size = (frame.shape[1], frame.shape[0])
@@ -201,15 +211,23 @@ class Collector:
                 "coarse for any; see whether its dialect has finer units"
             )
         camera.restrict(margin=_MARGIN, max_magnification=most)
+        longest = can.max_magnification
         for zoom in self._config.zooms:
-            if zoom > most:
+            if zoom > longest * _ROUNDING:
+                reason = f"the lens has no {zoom:g}x: it ends at {longest:.3g}x"
+            elif zoom > most:
                 reason = (
                     f"the head moves or reads in steps of {math.degrees(step):.2g} degrees, about "
                     f"{focal * zoom * step:.0f} px at {zoom:g}x: too coarse beyond {most:.3g}x"
                 )
-                refused = ZoomRecord(nominal_zoom=zoom, magnification=zoom, error=reason)
-                record.zooms.append(refused)
-        return [zoom for zoom in self._config.zooms if zoom <= most]
+            else:
+                continue
+            refused = ZoomRecord(nominal_zoom=zoom, magnification=zoom, error=reason)
+            record.zooms.append(refused)
+        zooms = [zoom for zoom in self._config.zooms if zoom <= min(most, longest * _ROUNDING)]
+        if not zooms:
+            raise CameraError(f"camera {self._config.name}: {record.zooms[0].error}")
+        return [min(zoom, longest) for zoom in zooms]
 
     def _collect_zoom(
         self,
@@ -286,20 +304,3 @@ class Collector:
         except Exception:
             logger.exception("camera %s: its progress cannot be reported", self._config.name)
             self._progress = lambda *_: None
-
-
-def _put_back(camera: Camera, start: Pose | None) -> None:
-    """Send the head back to where it was found, and undo what was switched. Never raises."""
-
-    def move() -> None:
-        if start is not None:
-            # Beyond the optical range only restore() can go: it knows of the digital zoom.
-            low, high = camera.capabilities.zoom_limits
-            camera.move(replace(start, zoom=min(max(start.zoom, low), high)))
-
-    # In this order: a move after restore() would end the digital zoom that it put back.
-    for action in (move, camera.restore, camera.close):
-        try:
-            action()
-        except Exception as error:
-            logger.warning("while putting it back: %s", error)

@@ -215,6 +215,12 @@ class TimingConfig(Section):
     """How long to wait for a camera. Seconds."""
 
     settle_timeout_s: PositiveSeconds = Field(15.0, description="for the head to come to rest")
+    settle_s: PositiveSeconds = Field(
+        0.3, description="between two pictures that must agree: a swinging head passes twice"
+    )
+    longest_s: float = Field(
+        86400.0, gt=0, description="for one camera; what is not finished then is given up"
+    )
     poll_interval_s: PositiveSeconds = Field(0.1, description="between two looks at its position")
     connect_timeout_s: PositiveSeconds = Field(3.0, description="for a connection")
     read_timeout_s: PositiveSeconds = Field(10.0, description="for an answer")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -11,17 +10,14 @@ from dataclasses import replace
 
 from torchptz.cameras import Camera, CameraError, Pose
 from torchptz.cameras.axes import Axis, HeadAxes
-from torchptz.cameras.zoom_curve import ZoomCurve
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.probe_mechanics import measure_mechanics, watch_motion
 from torchptz.fleet.probe_report import Check, ProbeReport, described
-from torchptz.fleet.stills import Stills
+from torchptz.fleet.putting_back import put_back
 from torchptz.scanning.axis_learning import AxesReport, learn_axes
-from torchptz.scanning.head_motion import Stopped
 from torchptz.scanning.registration import register
+from torchptz.scanning.still_pictures import Stills
 from torchptz.scanning.zoom_learning import ZoomReport, learn_zoom
-
-logger = logging.getLogger(__name__)
 
 Told = Callable[[str, int, int], None]  # what, done, total
 
@@ -30,6 +26,7 @@ _SECOND = 2.0  # magnification that the zoom is checked at
 _ZOOM_OFF = 0.15  # relative
 _STEEPEST = math.radians(45)  # near straight down a pan only turns the picture
 _STAGES = 5
+_STEADY_S = 0.3  # a head whose readings stay the same for so long is at rest
 
 
 def probe(
@@ -73,18 +70,21 @@ class _Probe:
     ) -> None:
         self._camera = camera
         self._config = config
+        self._believed = camera.axes, camera.zoom_curve  # by the caller, whose poses are of these
         self._tell = progress
         self._short = short
         self._report = ProbeReport(config.name, camera.identity)
         timing = config.timing
-        self._look = Stills(camera, stop, timing.settle_timeout_s, timing.poll_interval_s)
+        self._look = Stills(
+            camera, stop, timing.settle_timeout_s, timing.poll_interval_s, timing.settle_s
+        )
 
     def run(self) -> ProbeReport:
         camera, report = self._camera, self._report
         began, start, passed = time.monotonic(), None, False
-        believed = camera.axes, camera.zoom_curve
         try:
-            start = camera.position()
+            self._tell("probing: position", 0, _STAGES)
+            start = self._position()
             if not self._short:
                 camera.prepare()
             self._check(start)
@@ -93,8 +93,7 @@ class _Probe:
             text = str(error)
             report.refused = text if text.startswith("camera ") else f"{self._name}: {text}"
         finally:
-            if start is not None:
-                self._put_back(start, believed, passed)
+            self._put_back(start, passed)
         report.notes += self._look.notes()
         report.capabilities = described(camera.capabilities)
         report.moves, report.seconds = self._look.moves, time.monotonic() - began
@@ -102,8 +101,6 @@ class _Probe:
 
     def _check(self, start: Pose) -> None:
         camera, report = self._camera, self._report
-        self._tell("probing: position", 0, _STAGES)
-        report.checks.append(self._position())
         self._tell("probing: axes", 1, _STAGES)
         widest = camera.capabilities.zoom_limits[0]
         pan, tilt = camera.capabilities.nearest_reachable(
@@ -134,19 +131,25 @@ class _Probe:
 
     # ---- parts
 
-    def _position(self) -> Check:
-        """Read twice: the same, and within the limits."""
-        camera = self._camera
-        first, second = camera.position(), camera.position()
-        where = f"pan {math.degrees(second.pan):.2f}, tilt {math.degrees(second.tilt):.2f} deg"
-        if not self._look.head.same(first, second):
-            raise CameraError(
-                f"{self._name}: its position changes though nobody moved it (now {where}); stop "
-                "its tour or tracking, and keep other users away"
-            )
+    def _position(self) -> Pose:
+        """Where the head rests, once it does: an earlier run's may be on its way back."""
+        camera, timing = self._camera, self._config.timing
+        now = anchor = camera.position()
+        began = since = time.monotonic()
+        while time.monotonic() - since < _STEADY_S:
+            if time.monotonic() - began > timing.settle_timeout_s:
+                raise CameraError(
+                    f"{self._name}: its position changes though nobody moved it (now "
+                    f"{_where(now)}); stop its tour or tracking, and keep other users away"
+                )
+            self._look.head.check_stop()
+            time.sleep(min(timing.poll_interval_s, _STEADY_S / 2))
+            now = camera.position()
+            if not self._look.head.same(now, anchor):
+                anchor, since = now, time.monotonic()
         for what, angle, axis in (
-            ("pan", math.remainder(second.pan, 2 * math.pi), camera.axes.pan),
-            ("tilt", second.tilt, camera.axes.tilt),
+            ("pan", math.remainder(now.pan, 2 * math.pi), camera.axes.pan),
+            ("tilt", now.tilt, camera.axes.tilt),
         ):
             if not _within(angle, axis):
                 low, high = (math.degrees(end) for end in axis.angles)
@@ -154,7 +157,8 @@ class _Probe:
                     f"{self._name}: it reads {what} {math.degrees(angle):.2f} deg, beyond its own "
                     f"limits of {low:g} to {high:g}; check the ranges in the configuration (device)"
                 )
-        return Check("position", True, where)
+        self._report.checks.append(Check("position", True, _where(now)))
+        return now
 
     def _detail(self) -> tuple[float, float] | None:
         """Zoom units and magnification for learning scales."""
@@ -189,9 +193,11 @@ class _Probe:
         if before.signs_known and not report.learnt:
             senses = ["as configured"]
         roll = math.degrees(learnt.roll or 0.0)
-        report.checks.append(
-            Check("axes", True, f"{', '.join(senses)}; picture turned by {roll:+.1f} deg")
-        )
+        text = f"{', '.join(senses)}; picture turned by {roll:+.1f} deg"
+        if learnt.fit is not None:
+            sigma = 100 * max(learnt.fit.pan_sigma, learnt.fit.tilt_sigma)
+            text += f"; scales seen to {sigma:.1f} %"
+        report.checks.append(Check("axes", True, text))
         if after != before:
             self._camera.learn(axes=after)
 
@@ -209,11 +215,11 @@ class _Probe:
                 report.checks.append(check)
                 if not self._short and check.passed:
                     self._look.refocuses = True
-                    self._compare(learn_zoom(self._look, curve.limits, at, name=report.name))
+                    self._compare(self._learn_zoom(at))
                 return
             report.notes.append(f"{check.text}; its whole range was learnt from pictures")
         self._look.refocuses = True
-        learnt = learn_zoom(self._look, curve.limits, at, max_magnification=most, name=report.name)
+        learnt = self._learn_zoom(at, most)
         report.notes += learnt.notes
         if learnt.curve is None:
             report.checks.append(Check("zoom", None, "too little texture in the pictures"))
@@ -225,6 +231,17 @@ class _Probe:
         report.checks.append(Check("zoom", True, text + _digital(learnt)))
         report.learnt.append(f"zoom: {text}")
         camera.learn(zoom=learnt.curve)
+
+    def _learn_zoom(self, at: Pose, most: float | None = None) -> ZoomReport:
+        camera = self._camera
+        return learn_zoom(
+            self._look,
+            camera.zoom_curve.limits,
+            at,
+            quantum=camera.capabilities.zoom_quantum,
+            max_magnification=most,
+            name=self._report.name,
+        )
 
     def _twice(self, at: Pose) -> Check:
         """Whether the picture grows by 2 where the zoom says so."""
@@ -255,39 +272,27 @@ class _Probe:
 
     def _configured_zooms(self) -> None:
         """Whether the lens has them: a collection would refuse them, too."""
-        most = self._camera.capabilities.max_magnification
-        beyond = [f"{zoom:g}" for zoom in self._config.zooms if zoom > most * (1 + 1e-6)]
+        most = self._camera.zoom_curve.max_magnification
+        zooms = self._config.zooms
+        beyond = [f"{zoom:g}" for zoom in zooms if zoom > most * (1 + 1e-6)]
+        text = f"its lens goes to {most:.4g}x, and zooms asks for {', '.join(beyond)}"
+        if len(beyond) == len(zooms):
+            raise CameraError(f"{self._name}: {text}; ask for less")
         if beyond:
-            raise CameraError(
-                f"{self._name}: its lens goes to {most:.4g}x, and zooms asks for "
-                f"{', '.join(beyond)}; take them out"
-            )
+            self._report.notes.append(f"{text}: a collection leaves that out")
 
     # ---- leaving
 
-    def _put_back(self, start: Pose, believed: tuple[HeadAxes, ZoomCurve], passed: bool) -> None:
+    def _put_back(self, start: Pose | None, passed: bool) -> None:
         """Send the head to where it was, and restore what was prepared. Raises nothing.
 
-        believed: what ``start`` is a pose of, and so are the caller's; unless the camera passed,
-            its driver goes back to it.
+        Unless the camera passed, its driver believes again what the caller does.
         """
         camera = self._camera
         learnt = camera.axes, camera.zoom_curve
-        camera.learn(*believed)
-        low, high = camera.zoom_curve.limits
-        # Beyond the optical range only restore() can go.
-        pose = replace(start, zoom=min(max(start.zoom, low), high))
-        # What the next one does must not meet a head on its way.
-        send = self._look.head.go if self._short and passed else camera.move
-        steps = [(f"its head was at {_told(pose)}", lambda: send(pose))]
-        if not self._short:
-            steps.append(("its settings are not all as they were", camera.restore))
-        for left, action in steps:
-            try:
-                action()
-            except (CameraError, Stopped) as error:
-                logger.warning("%s: while putting it back: %s", self._name, error)
-                self._report.notes.append(f"it could not be put back: {left}")
+        camera.learn(*self._believed)
+        left = put_back(camera, start, self._config.timing, restore=not self._short, close=False)
+        self._report.notes += [f"it could not be put back: {what}" for what in left]
         if passed:
             camera.learn(*learnt)
 
@@ -302,9 +307,8 @@ def _same_place(pose: Pose, old: HeadAxes, new: HeadAxes) -> Pose:
     return replace(pose, pan=pan, tilt=new.tilt.angle(old.tilt.units(pose.tilt)))
 
 
-def _told(pose: Pose) -> str:
-    pan, tilt = math.degrees(pose.pan), math.degrees(pose.tilt)
-    return f"pan {pan:.2f}, tilt {tilt:.2f} deg, zoom {pose.zoom:g} units"
+def _where(pose: Pose) -> str:
+    return f"pan {math.degrees(pose.pan):.2f}, tilt {math.degrees(pose.tilt):.2f} deg"
 
 
 def _within(angle: float, axis: Axis) -> bool:

@@ -28,7 +28,8 @@ def probe_fleet(
     Args:
         cameras: of a fleet.
         out: folder; each camera gets its `probe.json` in a folder of its own.
-        progress: called with (camera, what, done, total) from the cameras' threads.
+        progress: called with (camera, what, done, total) from the cameras' threads; what it raises
+            is logged once, and ends nothing but the reports.
 
     Returns:
         Reports by name. What goes wrong with a camera stands in its report, and stops no other.
@@ -43,13 +44,31 @@ def probe_fleet(
             (out / config.name).mkdir(parents=True, exist_ok=True)
 
     def one(config: CameraConfig) -> ProbeReport:
-        report = _connected(config, lambda *what: progress(config.name, *what), stop)
+        tell = _telling(progress, config.name)
+        report = _connected(config, tell, stop)
         if out is not None:
             _save(report, out / config.name)
-        progress(config.name, "passed" if report.passed else "refused", 1, 1)
+        tell("passed" if report.passed else "refused", 1, 1)
         return report
 
     return run_workers({config.name: partial(one, config) for config in cameras}, stop)
+
+
+def _telling(progress: Progress, name: str) -> Told:
+    """Progress of one camera, that costs it nothing."""
+    heard = True
+
+    def tell(what: str, done: int, total: int) -> None:
+        nonlocal heard
+        if not heard:
+            return
+        try:
+            progress(name, what, done, total)
+        except Exception:
+            heard = False
+            logger.exception("camera %s: its progress cannot be reported", name)
+
+    return tell
 
 
 def _save(report: ProbeReport, folder: Path) -> None:

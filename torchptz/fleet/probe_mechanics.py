@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from torchptz.cameras import Pose
-from torchptz.cameras.axes import Axis
 from torchptz.fleet.probe_report import Check, ProbeReport
-from torchptz.fleet.stills import Stills
+from torchptz.scanning.axis_scales import inside
 from torchptz.scanning.registration import register
+from torchptz.scanning.still_pictures import Stills
 
 _MAGNIFICATION = 4.0  # at which returns are measured
 _RETURNS = 3  # from the same side; and 2 from the other one, of either axis
@@ -38,7 +38,7 @@ def measure_mechanics(look: Stills, at: Pose, px_per_rad: float, report: ProbeRe
     magnification = min(_MAGNIFICATION, camera.capabilities.max_magnification)
     zoom = camera.zoom_units(magnification)
     away = [max(_AWAY, _AWAY_QUANTA * axis.step) for axis in (axes.pan, axes.tilt)]
-    at = Pose(_amid(at.pan, axes.pan, away[0]), _amid(at.tilt, axes.tilt, away[1]), zoom)
+    at = Pose(inside(at.pan, axes.pan, away[0]), inside(at.tilt, axes.tilt, away[1]), zoom)
 
     def returned(pan_side: int, tilt_side: int) -> tuple[np.ndarray, Pose]:
         look(replace(at, pan=at.pan + pan_side * away[0], tilt=at.tilt + tilt_side * away[1]))
@@ -99,14 +99,6 @@ def watch_motion(look: Stills, at: Pose) -> Check:
     if not flags:
         return Check(name, False, "says that it rests while it moves; it is not believed")
     return Check(name, True, "says when it moves")
-
-
-def _amid(angle: float, axis: Axis, room: float) -> float:
-    """An angle with so much room to either side."""
-    low, high = axis.angles
-    if axis.circular:
-        return angle
-    return min(max(angle, low + room), high - room)
 
 
 def _pair(values: np.ndarray) -> tuple[float, float]:

@@ -60,4 +60,4 @@ def _end(running: Collection[Future], stop: threading.Event) -> None:
             wait([future for future in running if not future.cancel()])
             return
         except BaseException:
-            logger.warning("the heads are still being sent back")
+            logger.warning("the heads are still being sent back; Ctrl-\\ ends it and leaves them")

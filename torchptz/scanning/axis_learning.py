@@ -9,17 +9,23 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchptz.cameras import MotionError, Pose
-from torchptz.cameras.axes import Axis, HeadAxes
+from torchptz.cameras.axes import HeadAxes
 from torchptz.scanning.axis_fit import AxisFit
-from torchptz.scanning.axis_scales import beside, learn_scales
+from torchptz.scanning.axis_scales import (
+    Seen,
+    beside,
+    check_scales,
+    inside,
+    is_open,
+    learn_scales,
+)
 from torchptz.scanning.registration import Look, Similarity, register, static_pixels
-from torchptz.scanning.stillness import view_motion
+from torchptz.scanning.still_pictures import USUAL_FOV
+from torchptz.scanning.stillness import same_view
 
-_USUAL_FOV = math.radians(55)
 _FIRST_STEP = 0.14  # of the field of view: seen also of an axis whose scale is off by 2
 _STEEPEST = math.radians(45)  # of the first look; near straight down a pan only turns the picture
 _ASKEW, _LEVEL = math.radians(25), math.radians(6)  # turned so far: cannot be; worth a word
-_SCALE_OFF = 0.3
 
 
 @dataclass(frozen=True)
@@ -28,11 +34,10 @@ class AxesReport:
 
     axes: HeadAxes  # learnt, or as they were believed
     seen: bool  # False: too little texture; nothing was learnt
-    scales_learnt: bool = False
     px_per_rad: tuple[float, float] | None = None  # of pan (at the horizon) and tilt, widest zoom
     roll: float | None = None  # rad, how far the picture is turned against the head
     notes: tuple[str, ...] = ()
-    fit: AxisFit | None = field(default=None, repr=False)
+    fit: AxisFit | None = field(default=None, repr=False)  # None: scales were not told
 
 
 def learn_axes(
@@ -44,16 +49,17 @@ def learn_axes(
     name: str = "?",
     detail: tuple[float, float] | None = None,
 ) -> AxesReport:
-    """Check how the picture follows the head; learn signs, scales and the tilt's zero if open.
+    """Check how the picture follows the head: signs, scales and the tilt's zero. What is open is
+    learnt, and of scales and zero also what the pictures contradict.
 
     Args:
         look: goes to a pose and takes a picture.
-        axes: as believed; where ``signs_known``, a contradiction is an error.
+        axes: as believed; where ``sign_known``, a contradiction is an error.
         at: rad, where to look, and the units of the widest zoom.
         fov: rad, horizontal, at the widest zoom, if the device says.
         name: of the camera, for messages.
         detail: units of a zoom of 2x to 3x, where lenses bend little, and its magnification: used
-            where scales or the zero are to be learnt; None: the widest zoom.
+            where scales or the zero are learnt; None: the widest zoom.
 
     Returns:
         AxesReport. Without enough texture nothing is learnt, which its notes say.
@@ -62,37 +68,51 @@ def learn_axes(
         MotionError: the picture does not follow the head as it must; the message says the way out.
         CameraError: of the camera.
     """
-    report, at = _directions(look, axes, at, fov, name)
-    learnt = report.axes
-    open_ = (learnt.pan.scale_sigma, learnt.tilt.scale_sigma, learnt.tilt.offset_sigma)
-    if not (report.seen and any(open_)):
+    report, seen = _directions(look, axes, at, fov, name)
+    if not report.seen:
         return report
+    learnt = report.axes
     pan_sign, tilt_sign = (
         math.copysign(1.0, new.scale * old.scale)
         for new, old in ((learnt.pan, axes.pan), (learnt.tilt, axes.tilt))
     )
 
-    def look_so(pose: Pose) -> tuple[np.ndarray, Pose]:
-        """A look in the learnt axes; the head still goes by the others."""
-        frame, reading = look(Pose(pan_sign * pose.pan, tilt_sign * pose.tilt, pose.zoom))
-        return frame, Pose(pan_sign * reading.pan, tilt_sign * reading.tilt, reading.zoom)
+    def so(pose: Pose) -> Pose:
+        """In the learnt axes; the head still goes by the others, and the same turns it back."""
+        return Pose(pan_sign * pose.pan, tilt_sign * pose.tilt, pose.zoom)
 
-    at = Pose(pan_sign * at.pan, tilt_sign * at.tilt, at.zoom)
+    def look_so(pose: Pose) -> tuple[np.ndarray, Pose]:
+        frame, reading = look(so(pose))
+        return frame, so(reading)
+
+    seen = [(frame, replace(so(reading), zoom=at.zoom)) for frame, reading in seen]
+    checked = None
     try:
-        scales = learn_scales(look_so, learnt, at, report.px_per_rad, detail)
+        if not is_open(learnt):
+            checked = check_scales(look_so, learnt, seen, report.px_per_rad)
+        if checked is None or checked.contradicted:
+            # One look may have been disturbed: other views must say the same.
+            checked = learn_scales(look_so, learnt, seen[0][1], report.px_per_rad, detail)
     except ValueError as error:
-        note = (
-            f"scale and zero of the axes could not be learnt ({error}); they stay as believed: "
-            "point it at something with more texture, or set the units by the data sheet"
-        )
-        return replace(report, notes=(*report.notes, note))
+        if checked is None:
+            return replace(report, notes=(*report.notes, _not_told(learnt, error)))
+    wrong = (f"{one}; the pictures are believed" for one in checked.contradicted)
     return replace(
         report,
-        axes=scales.axes,
-        scales_learnt=True,
-        px_per_rad=(scales.focal_length, scales.focal_length),
-        fit=scales.fit,
+        axes=checked.axes,
+        px_per_rad=(checked.focal_length, checked.focal_length),
+        fit=checked.fit,
+        notes=(*report.notes, *wrong),
     )
+
+
+def _not_told(axes: HeadAxes, error: ValueError) -> str:
+    way_out = "point it at something with more texture, or compare its units with the data sheet"
+    if is_open(axes):
+        what = "scale and zero of the axes could not be learnt"
+    else:
+        what = "whether its degrees are degrees could not be checked"
+    return f"{what} ({error}); they stay as believed: {way_out}"
 
 
 # ---- signs and rotation
@@ -107,15 +127,18 @@ def learn_axes(
 
 def _directions(
     look: Look, axes: HeadAxes, at: Pose, fov: float | None, name: str
-) -> tuple[AxesReport, Pose]:
+) -> tuple[AxesReport, list[Seen]]:
     """Two small moves: which way, and how far, does the picture go with either axis? Also gives
-    the pose of the first look, in the axes as believed."""
-    step = _FIRST_STEP * (fov or _USUAL_FOV)
+    the three looks, read in the axes as believed."""
+    step = _FIRST_STEP * (fov or USUAL_FOV)
     at = replace(at, tilt=min(max(at.tilt, -_STEEPEST), _STEEPEST))
-    at = Pose(_inside(at.pan, axes.pan, 2 * step), _inside(at.tilt, axes.tilt, 2 * step), at.zoom)
+    at = Pose(inside(at.pan, axes.pan, 2 * step), inside(at.tilt, axes.tilt, 2 * step), at.zoom)
     turned = replace(at, pan=beside(at.pan, step / math.cos(at.tilt), axes.pan))
     both = replace(turned, tilt=beside(at.tilt, 0.7 * step, axes.tilt))
-    frames, readings = zip(*(look(pose) for pose in (at, turned, both)), strict=True)
+    # Twice: the first may be too near to where the head was to tell that its picture is not older.
+    look(at)
+    seen = [look(pose) for pose in (at, turned, both)]
+    frames, readings = zip(*seen, strict=True)
     moves = [_seen(a, b) for a, b in itertools.pairwise(frames)]
     if _STILL in moves:
         raise MotionError(f"camera {name}: {_stuck(moves)}")
@@ -123,7 +146,7 @@ def _directions(
         note = "the pictures show too little to see how the head moves"
         if not axes.signs_known:
             note += "; set pan_sign and tilt_sign, or point it at something with more texture"
-        return AxesReport(axes, seen=False, notes=(note,)), at
+        return AxesReport(axes, seen=False, notes=(note,)), seen
     turns = (
         math.remainder(readings[1].pan - readings[0].pan, 2 * math.pi),
         readings[2].tilt - readings[1].tilt,
@@ -145,11 +168,11 @@ def _directions(
             f"the picture is turned by {math.degrees(askew):.0f} deg against the head: give "
             "head.roll_sigma_deg room for that, or level it"
         )
-    for axis, sign in zip(("pan", "tilt"), signs, strict=True):
-        if sign < 0 and axes.signs_known:
+    for what, axis, sign in zip(("pan", "tilt"), (axes.pan, axes.tilt), signs, strict=True):
+        if sign < 0 and axis.sign_known:
             raise MotionError(
-                f"camera {name}: the picture moves against the {axis} axis; set {axis}_sign to the "
-                "other sign in its configuration"
+                f"camera {name}: the picture moves against the {what} axis; set {what}_sign to the "
+                "other sign in its configuration, or leave it out"
             )
     learnt = HeadAxes(
         axes.pan.reversed() if signs[0] < 0 else axes.pan,
@@ -160,8 +183,7 @@ def _directions(
         moves[0].moved / abs(turns[0]) / math.cos(at.tilt),
         moves[1].moved / abs(turns[1]),
     )
-    notes += _against_fov(per_rad, axes, fov, frames[0].shape[1])
-    return AxesReport(learnt, True, False, per_rad, askew, tuple(notes)), at
+    return AxesReport(learnt, True, per_rad, askew, tuple(notes)), seen
 
 
 def _signs(ways: list[float], name: str) -> tuple[tuple[int, int], float]:
@@ -191,7 +213,7 @@ def _signs(ways: list[float], name: str) -> tuple[tuple[int, int], float]:
 def _stuck(moves: list) -> str:
     if all(move is _STILL for move in moves):
         return (
-            "the picture stays as it is while the head says that it moves; is the picture frozen, "
+            "the picture stays as it is while the head says that it moves; is it dark or frozen, "
             "of another camera, or does the head accept moves without making them?"
         )
     axis = "pan" if moves[0] is _STILL else "tilt"
@@ -199,23 +221,6 @@ def _stuck(moves: list) -> str:
         f"the picture does not follow the {axis} axis, though its reading does; is that axis "
         "blocked, or is the picture a digital section of a fixed camera's?"
     )
-
-
-def _against_fov(
-    per_rad: tuple[float, float], axes: HeadAxes, fov: float | None, width: int
-) -> list[str]:
-    """A scale that is said to be exact, against a field of view that the device knows."""
-    if fov is None:
-        return []
-    expected = width / 2 / math.tan(fov / 2)
-    notes = []
-    for what, axis, found in zip(("pan", "tilt"), (axes.pan, axes.tilt), per_rad, strict=True):
-        if axis.scale_sigma == 0 and abs(found / expected - 1) > _SCALE_OFF:
-            notes.append(
-                f"{what} moves the picture {found / expected:.2f} times as far as its units and "
-                "the field of view say: one of them is wrong; check the units in the configuration"
-            )
-    return notes
 
 
 class _Still:
@@ -227,14 +232,6 @@ _STILL = _Still()
 
 def _seen(a: np.ndarray, b: np.ndarray) -> Similarity | _Still | None:
     """How the picture moved between two poses, what does not move in it left out."""
-    motion = view_motion(a, b)
-    if motion.textured and not motion.changed and motion.moved < 0.5:
+    if same_view(a, b):
         return _STILL
     return register(a, b, static_pixels(a, b))
-
-
-def _inside(angle: float, axis: Axis, room: float) -> float:
-    low, high = axis.angles
-    if axis.circular or high - low < 2 * room:
-        return angle
-    return min(max(angle, low + room), high - room)

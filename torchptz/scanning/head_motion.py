@@ -8,6 +8,7 @@ import time
 
 from torchptz.cameras import Camera, MotionError, Pose
 
+_AXES = ("pan", "tilt")
 # A head that has not arrived and whose readings do not change is given this long to (re)start.
 _PATIENCE_S = 2.0
 # Of one move: firmware may swallow the command after one that it refused.
@@ -49,6 +50,7 @@ class HeadMotion:
         poll_interval_s: between two readings.
         overshoot: rad; where an axis would arrive downwards it first goes so far beyond, so that
             its play always lies on the same side. More than the play; 0: directly.
+        deadline: s on the monotonic clock, when the camera is given up.
     """
 
     def __init__(
@@ -58,44 +60,88 @@ class HeadMotion:
         settle_timeout_s: float = 20.0,
         poll_interval_s: float = 0.05,
         overshoot: float = 0.0,
+        deadline: float = math.inf,
     ) -> None:
         self.camera = camera
         self._stop = stop
         self._timeout = settle_timeout_s
         self._poll = poll_interval_s
         self._overshoot = overshoot
-        self._sent: Pose | None = None
-        self._stood: Pose | None = None
+        self._deadline = deadline
+        self._stood: Pose | None = None  # where it was read last at rest
+        self._here: Pose | None = None  # where it was read since, before a command
+        self._upwards = {"pan": False, "tilt": False}  # whether an axis arrived so last
         self._believes_flag = True
         self._flag_stuck = False
         self._usual_miss = 0.0  # quanta by which the head stops beside its targets
 
     def check_stop(self) -> None:
-        """Raises Stopped where the run was asked to stop."""
+        """Raises Stopped where the run was asked to stop, MotionError where time is over."""
         if self._stop.is_set():
             raise Stopped
+        if time.monotonic() > self._deadline:
+            raise MotionError(
+                f"{self.name}: it was not finished in the time that it has; it answers or moves "
+                "too slowly, or has too much to do (timing.longest_s)"
+            )
 
     def way_to(self, pose: Pose) -> Pose | None:
         """A pose to go to first, so that both axes arrive upwards; None: the way there is right."""
         if not self._overshoot:
             return None
-        can, last = self.camera.capabilities, self._sent
+        can = self.camera.capabilities
+        here = self._here = self.camera.position()
         # As the device rounds them: a pose that differs by less turns no axis.
-        pan, tilt = can.nearest_reachable(pose.pan, pose.tilt)
-        via = []
-        for axis, target, low in (
-            ("pan", pan, can.pan_limits[0]),
-            ("tilt", tilt, can.tilt_limits[0]),
-        ):
-            ahead = None if last is None else target - getattr(last, axis)
-            if axis == "pan" and can.pan_circular:
-                ahead = None if ahead is None else math.remainder(ahead, 2 * math.pi)
-                low = -math.inf
-            down = ahead is None or ahead < -_FINEST / 10
-            via.append(max(target - self._overshoot, low) if down else target)
-        if via == [pan, tilt]:
-            return None
-        return Pose(*can.nearest_reachable(*via), pose.zoom)
+        target = dict(zip(_AXES, can.nearest_reachable(pose.pan, pose.tilt), strict=True))
+        moved = self._moves(here, Pose(*target.values(), pose.zoom))
+        via = {}
+        for axis, angle in target.items():
+            standing = self._arrived_upwards(here, axis)
+            right = self._ends_upwards(axis, moved[axis], standing)
+            via[axis] = angle if right else angle - self._step_back(axis, angle)
+        return None if via == target else Pose(*via.values(), pose.zoom)
+
+    def _arrived_upwards(self, here: Pose, axis: str) -> bool:
+        """Whether an axis stands where it arrived upwards; not if somebody moved it since."""
+        if self._stood is None:
+            return False
+        return self._upwards[axis] and abs(self._moves(self._stood, here)[axis]) <= self._flicker(
+            axis
+        )
+
+    def _ends_upwards(self, axis: str, moved: float, standing: bool) -> bool:
+        """Whether a move of so many rad ends with the play on the upward side.
+
+        standing: whether it was there before; else a move must be long enough to take it up.
+        """
+        if abs(moved) <= self._flicker(axis):
+            return standing
+        return moved > 0 and (standing or moved >= self._overshoot)
+
+    def _step_back(self, axis: str, angle: float) -> float:
+        """rad, the overshoot in whole steps, within the device's own limits."""
+        can = self.camera.capabilities
+        low = getattr(can, f"{axis}_limits")[0]
+        if self.camera.axes is not None:
+            # The margin that scanning keeps from the stops is there for this, too.
+            low = getattr(self.camera.axes, axis).angles[0]
+        back = self._overshoot
+        if not (axis == "pan" and can.pan_circular):
+            back = min(back, max(angle - low, 0.0))
+        quantum = getattr(can, f"{axis}_quantum")
+        return math.floor(back / quantum + 1e-6) * quantum if quantum else back
+
+    def _moves(self, before: Pose, after: Pose) -> dict[str, float]:
+        """rad, by axis; of pans the short way round, which an endless axis goes."""
+        pan = after.pan - before.pan
+        if self.camera.capabilities.pan_circular:
+            pan = math.remainder(pan, 2 * math.pi)
+        return {"pan": pan, "tilt": after.tilt - before.tilt}
+
+    def _flicker(self, axis: str) -> float:
+        """rad, by which two readings of one place may differ."""
+        quantum = getattr(self.camera.capabilities, f"{axis}_quantum")
+        return _FLICKER_QUANTA * max(quantum, _FINEST)
 
     def go(self, pose: Pose) -> Pose:
         """Send the head to a pose and wait until its readings are stable there.
@@ -107,11 +153,12 @@ class HeadMotion:
             MotionError: it did not move, stopped elsewhere or never came to rest.
         """
         self.check_stop()
-        self._send(pose)
+        self.camera.move(pose)
         sends = 1
         # Time counts from here: a camera that is slow to reply has not begun to move before.
         started = changed = time.monotonic()
-        first = self._stood  # where it was read before the command, if it was
+        began = first = self._here or self._stood  # where it was read before the command
+        self._here = None
         anchor = None  # the reading that later ones are the same as
         while True:
             self.check_stop()
@@ -124,16 +171,16 @@ class HeadMotion:
             elif self._arrived(reading, pose, now - changed, self.same(reading, first)):
                 if not self._waits_for_flag(now - changed):
                     self._learn_miss(reading, pose)
-                    self._stood = reading
+                    self._stand(began, reading)
                     return reading
                 time.sleep(self._poll)
                 continue
             # Two equal readings alone show nothing: a slow head's are whole quanta.
             if now - changed > (min(_PATIENCE_S, self._timeout / 2) if late else _PATIENCE_S):
                 moved = not self.same(reading, first)
-                if moved or late or sends == _MOST_SENDS:
+                if late or sends == _MOST_SENDS:
                     raise MotionError(self._not_there(pose, reading, moved))
-                self._send(pose)
+                self.camera.move(pose)
                 sends, changed = sends + 1, time.monotonic()
             if late:
                 raise MotionError(
@@ -159,10 +206,15 @@ class HeadMotion:
         flag = "; the device says that it still moves" if self._flag_stuck else ""
         return f"readings agree to a quantum, {where}; pictures agree{flag}"
 
-    def _send(self, pose: Pose) -> None:
-        self.camera.move(pose)
-        reachable = self.camera.capabilities.nearest_reachable(pose.pan, pose.tilt)
-        self._sent = Pose(*reachable, pose.zoom)
+    def _stand(self, began: Pose | None, reading: Pose) -> None:
+        """Note where the head has arrived, and from which side."""
+        moved = None if began is None else self._moves(began, reading)
+        for axis in _AXES:
+            standing = began is not None and self._arrived_upwards(began, axis)
+            self._upwards[axis] = moved is not None and self._ends_upwards(
+                axis, moved[axis], standing
+            )
+        self._stood = reading
 
     def _waits_for_flag(self, unchanged_s: float) -> bool:
         """Whether to wait for a device that says it moves though its readings stand still."""

@@ -14,15 +14,13 @@ from torchptz.cameras import Camera, MotionError, Pose
 from torchptz.scanning.detection import Detection, NotFound, detect_ball
 from torchptz.scanning.focus import FocusPerZoom
 from torchptz.scanning.head_motion import HeadMotion, Stopped
-from torchptz.scanning.stillness import pictures_still, view_motion
+from torchptz.scanning.still_pictures import SETTLE_S, FreshPictures
+from torchptz.scanning.stillness import pictures_still
 
 __all__ = ["WAY", "Observation", "Observer", "Stopped"]
 
-_MOST_PICTURES = 12  # per look; a picture that moves for longer will not come to rest
 _MOST_RETURNS = 3  # per look, after somebody else moved the head
 _STILL_PX = 0.5  # the feature's largest move between two pictures of a head at rest
-_TELLING_PX = 4.0  # a move of the head by so much must show in the picture
-_USUAL_FOV = math.radians(55)  # at the wide end, of a device that does not say
 WAY = "way"  # purpose of a stop that was made on the way to a pose
 
 
@@ -69,8 +67,10 @@ class Observer:
         record: called with every observation.
         stop: set by others to end the run; raises Stopped at the next step.
         settle_timeout_s: longest wait for a head to arrive.
-        poll_interval_s: between two readings.
+        poll_interval_s: between two readings, and two pictures.
         overshoot: rad, see `HeadMotion`.
+        settle_s: between two pictures that must agree.
+        deadline: s on the monotonic clock, see `HeadMotion`.
     """
 
     def __init__(
@@ -81,12 +81,16 @@ class Observer:
         settle_timeout_s: float = 20.0,
         poll_interval_s: float = 0.05,
         overshoot: float = 0.0,
+        settle_s: float = SETTLE_S,
+        deadline: float = math.inf,
     ) -> None:
         self.camera = camera
         self._record = record
-        self._head = HeadMotion(camera, stop, settle_timeout_s, poll_interval_s, overshoot)
+        self._head = HeadMotion(
+            camera, stop, settle_timeout_s, poll_interval_s, overshoot, deadline
+        )
         self._focus = FocusPerZoom(camera)
-        self._last: tuple[np.ndarray, Pose] | None = None  # picture and reading of the last look
+        self._fresh = FreshPictures(camera, self._head, settle_timeout_s, poll_interval_s, settle_s)
 
     def go(self, pose: Pose) -> Pose:
         """As `HeadMotion.go`."""
@@ -120,46 +124,29 @@ class Observer:
             MotionError: the head or the picture does not come to rest, or the picture does not
                 follow the head.
         """
-        before, returns = self._arrive(pose, direct), 0
-        stale = self._must_have_changed(before)
-        last: tuple[np.ndarray, Detection | NotFound] | None = None
-        for _ in range(_MOST_PICTURES):
-            self._head.check_stop()
-            frame = self.camera.snapshot()
-            if stale and self._is_old_view(frame):
-                continue  # from a buffer: it was taken before the head moved
-            stale = False
-            seen = detect_ball(
-                frame,
-                near=near(before) if callable(near) else near,
-                search_radius=search_radius,
-                expected_radius=expected_radius,
-            )
-            if last is None or not _agree(last, (frame, seen)):
-                last = (frame, seen)
-                continue
+        for _ in range(_MOST_RETURNS + 1):
+            before = self._arrive(pose, direct)
+            first = None  # picture and what is seen in it
+            for _, frame in self._fresh.after(before):
+                seen = detect_ball(
+                    frame,
+                    near=near(before) if callable(near) else near,
+                    search_radius=search_radius,
+                    expected_radius=expected_radius,
+                )
+                if first is not None and _agree(first, (frame, seen)):
+                    break
+                first = frame, seen
             after = self.camera.position()
             if self._head.same(before, after):
-                self._last = (frame, after)
+                self._fresh.leave(frame, after)
                 return self._observation(
-                    pose, before, after, last[1], seen, purpose, zoom_index, group
+                    pose, before, after, first[1], seen, purpose, zoom_index, group
                 )
             # Somebody moved it between the pictures: begin again.
-            returns += 1
-            if returns > _MOST_RETURNS:
-                raise MotionError(
-                    f"{self._head.name}: the head was moved {returns} times while it should be at "
-                    "rest; is a tour, a tracker or another user driving it?"
-                )
-            before, last = self._arrive(pose, direct), None
-        if stale:
-            raise MotionError(
-                f"{self._head.name}: the head reads that it moved and the picture still shows the "
-                "view from before; is the picture frozen, or the position that it reads not true?"
-            )
         raise MotionError(
-            f"{self._head.name}: the picture did not come to rest in {_MOST_PICTURES} pictures; is "
-            "the feature swinging, the mast shaking, or the image stabiliser on?"
+            f"{self._head.name}: the head was moved {_MOST_RETURNS + 1} times while it should be "
+            "at rest; is a tour, a tracker or another user driving it?"
         )
 
     def _arrive(self, pose: Pose, direct: bool) -> Pose:
@@ -172,30 +159,6 @@ class Observer:
         reading = self.go(pose)
         self._focus.at(pose.zoom)
         return reading
-
-    def _must_have_changed(self, now: Pose) -> bool:
-        """Whether the head has moved since the last look by more than a picture could hide."""
-        if self._last is None:
-            return False
-        before, can = self._last[1], self.camera.capabilities
-        width = self._last[0].shape[1]
-        ratio = self.camera.magnification(now.zoom) / self.camera.magnification(before.zoom)
-        if abs(math.log(ratio)) > _TELLING_PX / (width / 4):
-            return True
-        focal = width / 2 / math.tan((can.horizontal_fov or _USUAL_FOV) / 2)
-        pan = math.remainder(now.pan - before.pan, 2 * math.pi) * math.cos(now.tilt)
-        turned = math.hypot(pan, now.tilt - before.tilt)
-        return turned * focal * self.camera.magnification(now.zoom) > _TELLING_PX
-
-    def _is_old_view(self, frame: np.ndarray) -> bool:
-        """Whether a picture shows what the last look saw; nothing is said without texture."""
-        old = self._last[0]
-        if old.shape != frame.shape:
-            return False
-        if np.array_equal(old, frame):
-            return True
-        motion = view_motion(old, frame, _STILL_PX)
-        return motion.textured and not motion.changed and motion.moved < _STILL_PX
 
     def _observation(
         self,

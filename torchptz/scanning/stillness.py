@@ -32,6 +32,17 @@ def pictures_still(frame_a: np.ndarray, frame_b: np.ndarray, threshold_px: float
     return not motion.changed and (not motion.textured or motion.moved < threshold_px)
 
 
+def same_view(frame_a: np.ndarray, frame_b: np.ndarray, threshold_px: float = 0.5) -> bool:
+    """True only where texture proves that two frames show one view; see `pictures_still`.
+
+    Frames of different shapes do not.
+    """
+    if frame_a.shape != frame_b.shape:
+        return False
+    motion = view_motion(frame_a, frame_b, threshold_px)
+    return motion.textured and not motion.changed and motion.moved < threshold_px
+
+
 def view_motion(frame_a: np.ndarray, frame_b: np.ndarray, threshold_px: float = 0.5) -> Motion:
     """Shift between two frames from the gradients of many tiles of the reduced pictures.
 

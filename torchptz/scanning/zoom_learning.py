@@ -16,8 +16,10 @@ from torchptz.scanning.registration import Look, Similarity, register
 _RATIO = 1.5  # of magnifications, between two looks
 _HALVINGS = 4
 _LARGEST = 2.5  # ratio that a match is believed
+_COARSE = 0.01  # of the range: a dead beginning that is shorter is none
 _DEAD = 0.01  # of the logarithm: less is no magnification
 _BACKWARD = 0.03  # of the logarithm
+_ENOUGH = 3  # looks, after which one that fails ends the curve and not the camera's probe
 _TURNED = math.radians(5)  # the head moved meanwhile
 _BENT = 0.005  # relative error of a step: the lens's distortion, other at every zoom
 _USUAL_MAXIMUM = 20.0
@@ -54,6 +56,7 @@ def learn_zoom(
     limits: tuple[float, float],
     at: Pose,
     *,
+    quantum: float = 0.0,
     max_magnification: float | None = None,
     name: str = "?",
 ) -> ZoomReport:
@@ -63,21 +66,24 @@ def learn_zoom(
         look: goes to a pose and takes a picture.
         limits: device units of the widest and the longest zoom.
         at: pan and tilt to look at.
+        quantum: device units, the smallest step of the zoom; 0: continuous.
         max_magnification: what the device says of its long end, if it does.
         name: of the camera, for messages.
 
     Returns:
-        ZoomReport. The curve ends where nothing more is magnified or a digital part begins, and is
-        a guess from where pictures show too little; its notes say so.
+        ZoomReport. The curve is of units as they are commanded: readings may lie beside them. It
+        ends where nothing more is magnified or a digital part begins, and is
+        a guess from where pictures show too little or do not come to rest; its notes say so.
 
     Raises:
-        MotionError: the camera does not zoom, or the wrong way; the message says the way out.
+        MotionError: the camera does not zoom, or the wrong way, or no picture of it comes to rest;
+            the message says the way out.
         CameraError: of the camera.
     """
     low, high = limits
     guess = ZoomCurve.guess(limits, max_magnification or _USUAL_MAXIMUM)
     before, reading = look(Pose(at.pan, at.tilt, low))
-    steps = [_Step(reading.zoom, 0.0, fine_detail(before))]
+    steps, read = [_Step(low, 0.0, fine_detail(before))], reading.zoom
     dead: list[tuple[float, float]] = []
     notes: list[str] = []
     pace, variance = 1.0, 0.0  # pace: how much faster it zooms than guessed
@@ -86,7 +92,15 @@ def learn_zoom(
         seen = None
         for part in (0.5**n for n in range(_HALVINGS + 1)):
             units = _further(guess, reached, part * math.log(_RATIO) / pace)
-            frame, reading = look(Pose(at.pan, at.tilt, units))
+            units = _on_grid(units, (reached, high), quantum)
+            try:
+                frame, reading = look(Pose(at.pan, at.tilt, units))
+            except MotionError as error:
+                # Its long end, where nothing rests, may be wanted by nobody.
+                if len(steps) < _ENOUGH:
+                    raise
+                notes.append(f"at {units:g} units of zoom: {error}")
+                break
             seen = _magnified(before, frame)
             if seen is not None:
                 break
@@ -95,15 +109,19 @@ def learn_zoom(
         grown = math.log(seen.scale)
         if grown < -max(_BACKWARD, 4 * seen.scale_sigma):
             raise MotionError(_backward(name, reached, units, seen.scale, len(steps) == 1))
-        if grown < max(_DEAD, 3 * seen.scale_sigma) or reading.zoom <= steps[-1].units:
+        if grown < max(_DEAD, 3 * seen.scale_sigma) or reading.zoom <= read:
             dead.append((reached, units))
             reached, pace = units, max(pace / 2, 0.1)
             continue
         told = math.log(guess.magnification_of(units) / guess.magnification_of(before_at))
         pace = min(max(grown / told, 0.1), 10.0)
         if len(steps) == 1 and dead:
-            steps[0] = _Step(reached, 0.0, steps[0].detail)
-        steps.append(_Step(reading.zoom, steps[-1].log + grown, fine_detail(frame)))
+            if reached - low > max(quantum, _COARSE * (high - low)):
+                steps[0] = _Step(reached, 0.0, steps[0].detail)
+            else:
+                dead.clear()  # a lens that begins to move a step late
+        read = reading.zoom
+        steps.append(_Step(units, steps[-1].log + grown, fine_detail(frame)))
         variance += seen.scale_sigma**2
         before, before_at, reached = frame, units, units
     if len(steps) == 1:
@@ -200,6 +218,14 @@ def _further(guess: ZoomCurve, units: float, log: float) -> float:
     if wanted * math.exp(0.25 * log) >= guess.max_magnification:
         return guess.limits[1]
     return guess.units_of(wanted)
+
+
+def _on_grid(units: float, between: tuple[float, float], quantum: float) -> float:
+    """Units that the zoom can have, a step beyond the lower ones at least."""
+    low, high = between
+    if quantum:
+        units = max(round(units / quantum), math.floor(low / quantum + 1e-6) + 1) * quantum
+    return min(units, high)
 
 
 def _continued(curve: ZoomCurve, guess: ZoomCurve, most: float | None) -> ZoomCurve:

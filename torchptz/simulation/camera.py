@@ -6,7 +6,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
 from math import atan, pi, radians
 from threading import Lock
 
@@ -16,17 +15,17 @@ import numpy as np
 from .config import CameraConfig, FaultConfig
 from .focus import Focus
 from .head import FLIP_TILT, Head
+from .noise import noisy
 from .optics import DIGITAL_UNITS, OPTICAL_UNITS, LensState, Optics
-from .picture_faults import clock_text, crop, hunting, shaken, turned, upside_down
+from .picture_buffer import PictureBuffer
+from .picture_faults import blurred, clock_text, crop, hunting, shaken, turned, upside_down
 from .scene import World, draw_text
 from .texture import Background
 from .view import HeadPose, Mount, View
 from .zoom_scale import scale_of
 
 STEP, MARGIN = 8, 8  # px between the nodes where rays are computed, and px beyond the border
-NOISE_SLACK = 64  # px by which a noise picture may be shifted
 CACHED_ZOOMS = 32
-NOISE_PICTURES, NOISE_PIXELS = 6, 2_400_000  # fewer of large pictures, though two at least
 HIDDEN_CROP_FROM = 0.75 * OPTICAL_UNITS
 
 
@@ -53,9 +52,10 @@ class SimulatedCamera:
         )
         self.world = World.from_config(config.scene, config.seed)
         self.head = Head(config.head, config.seed, clock)
+        self._clock = clock
         self.digital_zoom = False
         self.set_digital_zoom(config.digital_zoom)
-        self.focus = Focus(self.head.time)
+        self.focus = Focus(self.head.time, lambda: self.head.true_pose().zoom_units)
         self.overlay = True  # the switch of what is written into the picture
         self.stabiliser = True  # its switch
         self.zoom_scale = scale_of(config.dialect, self.optics)
@@ -66,6 +66,9 @@ class SimulatedCamera:
         self._lock = Lock()
         self._frames = self._moves = self._stale = 0
         self._pose_before: HeadPose | None = None  # the last command
+        self._buffer = PictureBuffer(
+            lambda moment: self.head.true_pose(moment * config.head.speed_up)
+        )
         self._frozen: HeadPose | None = None  # position
         self._grids: OrderedDict[float, np.ndarray] = OrderedDict()
         self.set_faults(**config.faults.model_dump())
@@ -106,6 +109,7 @@ class SimulatedCamera:
 
     def stop(self, pan_tilt: bool = True, zoom: bool = True) -> None:
         """Stops at the next position where the motors can."""
+        self._commanded()
         if pan_tilt:
             self.head.stop()
         if zoom:
@@ -118,6 +122,10 @@ class SimulatedCamera:
         pose = self._frozen or self.head.reading()
         if self.faults.pan_reading_0_360:
             pose = pose._replace(pan=-(-pose.pan % (2 * pi)))
+        if self.faults.zoom_reading_offset_units:
+            told = self.zoom_scale.to_device(pose.zoom_units)
+            told += self.faults.zoom_reading_offset_units
+            pose = pose._replace(zoom_units=self.zoom_scale.to_body(told))
         return pose
 
     def moving(self) -> bool:
@@ -151,8 +159,9 @@ class SimulatedCamera:
 
     def true_pose(self, pan: float, tilt: float, zoom_units: float) -> HeadPose:
         """The true pose behind settled readings (rad), without jitter and play: adds tilt zero."""
-        pan = -pan if self.faults.pan_reversed else pan
-        tilt = -tilt if self.faults.tilt_reversed else tilt
+        turns = 1 + self.faults.units_off_percent / 100
+        pan *= -turns if self.faults.pan_reversed else turns
+        tilt *= -turns if self.faults.tilt_reversed else turns
         return HeadPose(pan, tilt + radians(self.config.head.tilt_zero_deg), float(zoom_units))
 
     def view(self, pose: HeadPose) -> View:
@@ -171,26 +180,41 @@ class SimulatedCamera:
         return self.view(pose).project(self.world.board.corners())
 
     def snapshot(self, overlay: bool | None = None) -> bytes:
-        """JPEG of the head's true state now; successive pictures carry different noise.
+        """JPEG of the head's true state, now or when it last took a picture; pictures that are
+        not the same carry different noise.
 
         overlay: whether this picture has what is written into pictures; None: as it is switched.
         """
-        pose = self.head.true_pose()
+        overlay, period = self.overlay if overlay is None else overlay, self.faults.picture_period_s
+        if not period:
+            return self._jpeg(self._pose_shown(), self._clock(), overlay)
+        exposure = self._buffer.exposure(self._clock(), period)
+        if overlay not in exposure.jpegs:
+            jpeg = self._jpeg(exposure.pose, exposure.moment, overlay)
+            exposure.jpegs.setdefault(overlay, jpeg)  # two may have asked at the same time
+        return exposure.jpegs[overlay]
+
+    def _jpeg(self, pose: HeadPose, moment: float, overlay: bool) -> bytes:
         with self._lock:
             number, self._frames = self._frames, self._frames + 1
-            if self._stale:
-                self._stale, pose = self._stale - 1, self._pose_before
-        frame = self.render(pose, number, self.head.time(), overlay)
+        frame = self.render(pose, number, moment, overlay)
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
         return cv2.imencode(".jpg", frame, quality)[1].tobytes()
+
+    def _pose_shown(self) -> HeadPose:
+        pose = self.head.true_pose()
+        with self._lock:
+            if self._stale:
+                self._stale, pose = self._stale - 1, self._pose_before
+        return pose
 
     def render(
         self, pose: HeadPose, number: int = 0, moment: float = 0.0, overlay: bool | None = None
     ) -> np.ndarray:
         """(H, W, 3) uint8 BGR at a true pose (rad, zoom units), before JPEG.
 
-        `number` chooses the noise and `moment` (s, the head's clock) the state of what changes by
-        itself: the same camera, pose, number and moment give the same frame.
+        `number` chooses the noise and `moment` (s, the wall's clock) the state of what changes by
+        itself: the same camera, pose, number, moment and focus give the same frame.
         """
         faults = self.faults
         lens_units, factor = self.optics.crop(HeadPose(*pose).zoom_units)
@@ -198,10 +222,11 @@ class SimulatedCamera:
         view = self.view(pose)
         frame = self._draw_background(view, pose)
         self.world.draw(frame, view, self.config.psf_px, ball=not faults.ball_hidden)
+        frame = blurred(frame, self.focus.blur_px(lens_units, frame.shape[1]))
         if faults.focus_hunting and self.focus.searching():
             frame = hunting(frame, moment)
         if self.config.noise_dn:
-            frame = self._with_noise(frame, number)
+            frame = noisy(frame, self.config.noise_dn, [self.config.seed, 7, number])
         if faults.eis_jitter_px and self.stabiliser:
             frame = shaken(frame, faults.eis_jitter_px, [self.config.seed, 11, number])
         if factor > 1:
@@ -217,7 +242,9 @@ class SimulatedCamera:
         return frame
 
     def _commanded(self) -> None:
-        """Notes the view before a command, which stale pictures go on to show."""
+        """Notes the view before a command, which old pictures go on to show."""
+        if self.faults.picture_period_s:
+            self._buffer.exposure(self._clock(), self.faults.picture_period_s)
         if self.faults.stale_frames:
             pose = self.head.true_pose()
             with self._lock:
@@ -251,26 +278,8 @@ class SimulatedCamera:
                 self._grids.popitem(last=False)
         return rays
 
-    def _with_noise(self, frame: np.ndarray, number: int) -> np.ndarray:
-        bank = _noise_bank(self.config.image_size, self.config.noise_dn)
-        rng = np.random.default_rng([self.config.seed, 7, number])
-        which, (x, y) = rng.integers(len(bank)), rng.integers(0, NOISE_SLACK, 2)
-        width, height = self.config.image_size
-        noise = np.ascontiguousarray(bank[which][y : y + height, x : x + width])
-        return cv2.add(frame, noise, dtype=cv2.CV_8U)
-
 
 def _pan_back(pan: float) -> np.ndarray:
     """R_p transposed as a float32 right factor: world rays with the head's pan taken out."""
     c, s = np.cos(pan), np.sin(pan)
     return np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-
-
-@lru_cache(maxsize=4)
-def _noise_bank(size: tuple[int, int], sigma: float) -> np.ndarray:
-    """Noise pictures shared by all cameras of a kind; drawing fresh ones costs 10 ms a frame."""
-    rng = np.random.default_rng(8)
-    shape = (size[1] + NOISE_SLACK, size[0] + NOISE_SLACK, 3)
-    count = min(max(NOISE_PIXELS // (shape[0] * shape[1]), 2), NOISE_PICTURES)
-    pictures = (rng.standard_normal(shape, np.float32) for _ in range(count))
-    return np.stack([np.rint(picture * sigma).astype(np.int8) for picture in pictures])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from .settings import Count, NonNegativeFloat, Section
 
@@ -10,8 +12,9 @@ from .settings import Count, NonNegativeFloat, Section
 class FaultConfig(Section):
     """Every fault is off by default and may also be switched at run time.
 
-    "Every Nth" counts what the switch is about and is 0 for never. Seconds of the head run on the
-    head's clock, which `speed_up` hastens; those of the wire on the wall's.
+    "Every Nth" counts what the switch is about and is 0 for never. Times of the head run on the
+    head's clock, which `speed_up` hastens; those of the wire and of pictures, and what is said to
+    be of the wall's clock, do not.
     """
 
     # the server
@@ -49,14 +52,18 @@ class FaultConfig(Section):
     no_position: bool = False  # has no position to tell
     frozen_position: bool = False  # tells the position of when this was switched on
     pan_reading_0_360: bool = False  # counts pan to the right from 0 to 360 degrees
+    units_off_percent: Annotated[float, Field(gt=-50, lt=50)] = 0.0  # it turns so much further
+    # than it is told and than it reads
+    zoom_reading_offset_units: float = 0.0  # reads so many units of its own more
 
     # the head
+    command_delay_s: NonNegativeFloat = 0.0  # carries out every command so much later, wall's clock
     head_stuck: bool = False  # accepts pan and tilt commands and does not move
     ignore_move_every: Count = 0  # accepts every Nth pan and tilt command and does not move
     pan_reversed: bool = False  # turns the other way than it reads
     tilt_reversed: bool = False
     backlash_first_step: NonNegativeFloat = 0.0  # quanta more in the first step after a reversal
-    overshoot_deg: NonNegativeFloat = 0.0  # swings so much more after arrival
+    overshoot_deg: NonNegativeFloat = 0.0  # swings so much more after arrival, wall's clock
     coast_deg: NonNegativeFloat = 0.0  # stops up to so far beyond the target, and reads it
     drift_deg_per_minute: float = 0.0  # the truth leaves the reading, pan and tilt alike
     zero_loss_deg: NonNegativeFloat = 0.0  # the truth stays so much behind at every hard stop
@@ -65,6 +72,9 @@ class FaultConfig(Section):
     second_operator_s: NonNegativeFloat = 0.0  # somebody else moves it so often
 
     # lens and picture
+    zoom_backlash_units: NonNegativeFloat = 0.0  # stops up to so many units of the motor short of
+    # what it reads when it comes from the long end
+    picture_period_s: NonNegativeFloat = 0.0  # a new picture only so often, the same one meanwhile
     focus_hunting: bool = False  # while the focus is automatic the picture breathes and blurs
     digital_zoom_hidden: bool = False  # the last quarter of the "optical" range is a crop
     eis_jitter_px: NonNegativeFloat = 0.0  # one sigma; while the stabiliser is on

@@ -9,6 +9,7 @@ what the faults do to the head comes on top.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from math import copysign, exp, pi, radians, sin
 from threading import RLock
@@ -21,6 +22,7 @@ from .head_axis import HeadAxis, wrapped
 from .motion import Leg
 from .optics import OPTICAL_UNITS
 from .view import HeadPose
+from .zoom_axis import ZoomAxis
 
 TILT_ORIGIN = radians(27.9)  # tilt at which the SNC-RZ30P's tilt motor counts zero
 RING_PERIODS = 4.0  # swings within the ring's time
@@ -54,7 +56,7 @@ class Head:
         self._home = 0.0, radians(config.tilt_origin_deg)
         self._pan, self._tilt = (
             HeadAxis(
-                _standing(home, now),
+                Leg.standing(home, now),
                 tuple(radians(limit) for limit in ends),
                 radians(1 / per_deg),
                 home,
@@ -71,7 +73,8 @@ class Head:
                 strict=True,
             )
         )
-        self._zoom = _standing(0.0, now)
+        self._zoom = ZoomAxis.standing(0.0, now)
+        self._waiting: deque[tuple[float, Callable[[float], None]]] = deque()  # due, and what to do
         self._commanded = self._drifts_from = self._operated = now
         self._is_home = False
 
@@ -87,6 +90,8 @@ class Head:
                 self._operated = now
             if not faults.zero_loss_deg:
                 self._pan, self._tilt = self._pan.found_again(), self._tilt.found_again()
+            if not faults.zoom_backlash_units:
+                self._zoom = ZoomAxis(self._zoom.leg)
 
     def move_to(self, pan: float, tilt: float, pan_speed: float, tilt_speed: float) -> None:
         """Starts a move to a pose (rad) at speeds (rad/s) and returns; targets are clipped.
@@ -94,40 +99,34 @@ class Head:
         Both axes draw a new stop error when either of them moves; asking for the pose where the
         head already stands moves nothing and draws nothing.
         """
-        with self._lock:
-            now = self._now()
-            self._command(now)
-            self._go(pan, tilt, pan_speed, tilt_speed, now)
+        self._obey(lambda now: self._go(pan, tilt, pan_speed, tilt_speed, now))
 
     def stop(self) -> None:
         """Stops pan and tilt at the next position where the motors can stop."""
-        with self._lock:
-            now = self._now()
-            self._command(now)
+
+        def halt(now: float) -> None:
             coast = radians(self._faults.coast_deg)
             goals = [axis.halt(now, coast) for axis in (self._pan, self._tilt)]
             self._start_both(*goals, 1.0, 1.0, now)
 
+        self._obey(halt)
+
     def zoom_to(self, units: float, speed_share: float = 1.0) -> None:
         """Starts a zoom move, clipped to the present range; speed as a share of the fastest."""
-        with self._lock:
-            now = self._now()
-            self._command(now)
-            goal = float(round(min(max(units, 0.0), self.zoom_limit)))
-            self._zoom = self._zoom_leg(goal, speed_share, now)
+        self._obey(lambda now: self._start_zoom(units, speed_share, now))
 
     def zoom_stop(self) -> None:
-        with self._lock:
-            now = self._now()
-            self._command(now)
-            self._zoom = _standing(float(round(self._zoom.position(now))), now)
+        def halt(now: float) -> None:
+            self._zoom = ZoomAxis.standing(float(round(self._zoom.position(now))), now)
+
+        self._obey(halt)
 
     def set_zoom_limit(self, limit: float) -> None:
         """Changes the zoom's upper end; a zoom beyond it falls back to it at once."""
         with self._lock:
             self.zoom_limit = float(limit)
-            if max(self._zoom.goal, self._zoom.position(self._now())) > limit:
-                self._zoom = _standing(self.zoom_limit, self._now())
+            if max(self._zoom.leg.goal, self._zoom.position(self._now())) > limit:
+                self._zoom = ZoomAxis.standing(self.zoom_limit, self._now())
 
     def reading(self) -> HeadPose:
         """The pose as the head reports it: the motors' positions in whole quanta (rad, units)."""
@@ -137,49 +136,66 @@ class Head:
             tilt = self._tilt.snapped(self._tilt.leg.position(now))
             return HeadPose(wrapped(pan), tilt, float(round(self._zoom.position(now))))
 
-    def true_pose(self) -> HeadPose:
-        """The pose of the mechanical axes at this instant (rad, zoom units)."""
+    def true_pose(self, at: float | None = None) -> HeadPose:
+        """The pose of the mechanical axes (rad, zoom units), of this instant unless `at` says
+        another since the last command (s, the head's clock)."""
         with self._lock:
             now, faults = self._now(), self._faults
+            now = now if at is None else min(at, now)
             drift = radians(faults.drift_deg_per_minute) * (now - self._drifts_from) / 60
-            pan = self._true(self._pan, now) * (-1 if faults.pan_reversed else 1) + drift
-            tilt = self._true(self._tilt, now) * (-1 if faults.tilt_reversed else 1) + drift
+            turns = 1 + faults.units_off_percent / 100
+            pan = self._true(self._pan, now) * (-turns if faults.pan_reversed else turns) + drift
+            tilt = self._true(self._tilt, now) * (-turns if faults.tilt_reversed else turns) + drift
             tilt += radians(self.config.tilt_zero_deg)
             if faults.auto_flip and tilt > FLIP_TILT:
                 pan += pi
-            return HeadPose(wrapped(pan), tilt, self._zoom.position(now))
+            return HeadPose(wrapped(pan), tilt, self._zoom.true(now))
 
     def moving(self) -> bool:
         """Whether anything still moves, the swing after arrival included."""
         with self._lock:
             now = self._now()
-            settled = max(a.leg.end + self._ring_time(a) for a in (self._pan, self._tilt))
-            return now < max(settled, self._zoom.end)
+            ends = [self._zoom.leg.end]
+            for axis in (self._pan, self._tilt):
+                ends += [axis.leg.end, *(axis.leg.end + lasts for _, lasts in self._swings(axis))]
+            return bool(self._waiting) or now < max(ends)
 
     def motors_run(self) -> bool:
         """Whether a motor still runs, which is all that a device can know."""
         with self._lock:
             now = self._now()
-            return now < max(leg.end for leg in (self._pan.leg, self._tilt.leg, self._zoom))
+            return now < max(axis.leg.end for axis in (self._pan, self._tilt, self._zoom))
 
     def time(self) -> float:
         """s on the head's clock."""
         return self._clock() * self.config.speed_up
 
     def _now(self) -> float:
-        """The present, after what the head has done by itself until then."""
+        """The present, after what the head was still to do and has done by itself until then."""
         now, faults = self.time(), self._faults
+        while self._waiting and self._waiting[0][0] <= now:
+            due, act = self._waiting.popleft()
+            act(due)
         due = self._commanded + faults.return_home_s
         if faults.return_home_s and now >= due and not self._is_home:
             self._is_home = True
             self._go(*self._home, *self._fastest(), due)
-            self._zoom = self._zoom_leg(0.0, 1.0, due)
+            self._start_zoom(0.0, 1.0, due)
         if faults.second_operator_s:
             turns = int((now - self._operated) / faults.second_operator_s)
             if turns:
                 self._operated += turns * faults.second_operator_s
                 self._operate(self._operated)
         return now
+
+    def _obey(self, act: Callable[[float], None]) -> None:
+        """Has a command carried out, at once or when the device gets round to it."""
+        with self._lock:
+            now = self._now()
+            self._command(now)
+            delay = self._faults.command_delay_s * self.config.speed_up  # of the wall's clock
+            self._waiting.append((now + delay, act))
+            self._now()
 
     def _command(self, now: float) -> None:
         self._commanded, self._is_home = now, False
@@ -226,28 +242,31 @@ class Head:
         error = float(self._rng.uniform(-half, half)) if half else 0.0
         return axis.started(leg, error, radians(self._faults.zero_loss_deg))
 
-    def _zoom_leg(self, goal: float, share: float, now: float) -> Leg:
+    def _start_zoom(self, units: float, share: float, now: float) -> None:
+        goal = float(round(min(max(units, 0.0), self.zoom_limit)))
+        start, play = self._zoom.position(now), self._faults.zoom_backlash_units
         speed = self.config.zoom_units_per_s * max(share, 0.01)
-        return Leg(self._zoom.position(now), goal, now + self.config.zoom_delay_s, speed)
+        leg = Leg(start, goal, now + self.config.zoom_delay_s, speed)
+        short = play * self._chance.uniform(0.5, 1.0) if play and goal < start else 0.0
+        self._zoom = self._zoom.started(leg, short)
 
     def _true(self, axis: HeadAxis, now: float) -> float:
         lead = axis.sense * self._faults.backlash_first_step * axis.quantum / 2
         return axis.load_at(now) + axis.error_at(now) + self._ring(axis, now) + lead
 
-    def _ring_time(self, axis: HeadAxis) -> float:
-        swings = self.config.ring_deg or self._faults.overshoot_deg
-        return self.config.ring_time_s if axis.leg.distance and swings else 0.0
+    def _swings(self, axis: HeadAxis) -> list[tuple[float, float]]:
+        """How far (rad) and for how long (s, the head's clock) an axis swings after its leg."""
+        way, lasts = axis.leg.distance, self.config.ring_time_s
+        usual = min(radians(self.config.ring_deg), RING_SHARE * way)
+        fault = min(radians(self._faults.overshoot_deg), way / 2)
+        # That of the fault is of the wall's clock: however fast a head is made, it can be met.
+        swings = (usual, lasts), (fault, lasts * self.config.speed_up)
+        return [(size, lasts) for size, lasts in swings if size]
 
     def _ring(self, axis: HeadAxis, now: float) -> float:
-        """A swing that begins in the direction of travel and is cut off when it has died down."""
-        t, total = now - axis.leg.end, self._ring_time(axis)
-        if not 0 < t < total:
-            return 0.0
-        size = min(radians(self.config.ring_deg), RING_SHARE * axis.leg.distance)
-        size += min(radians(self._faults.overshoot_deg), axis.leg.distance / 2)
-        swing = exp(-10 * t / total) * sin(2 * pi * RING_PERIODS * t / total)
-        return copysign(size, axis.leg.goal - axis.leg.start) * swing
-
-
-def _standing(position: float, now: float) -> Leg:
-    return Leg(position, position, now, 1.0)
+        """Swings that begin in the direction of travel and are cut off when they have died down."""
+        t, total = now - axis.leg.end, 0.0
+        for size, lasts in self._swings(axis):
+            if 0 < t < lasts:
+                total += size * exp(-10 * t / lasts) * sin(2 * pi * RING_PERIODS * t / lasts)
+        return copysign(1.0, axis.leg.goal - axis.leg.start) * total

@@ -15,6 +15,7 @@ from urllib.request import parse_http_list, parse_keqv_list
 
 from .config import CameraConfig
 from .faults import FaultConfig
+from .lockout import Lockout
 
 CAP_WINDOW_S = 1.0  # how long a connection counts against the cap
 NONCES_KEPT = 256
@@ -26,6 +27,7 @@ class Login:
 
     schemes: what the dialect's devices offer, the configuration's own go before. `rejected` counts
     logins whose name or password was wrong, and nothing else. Times are of the wall, `clock` in s.
+    lockout: shared with whoever else judges logins of this camera.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class Login:
         realm: str,
         schemes: tuple[str, ...] = ("basic",),
         clock: Callable[[], float] = time.monotonic,
+        lockout: Lockout | None = None,
     ) -> None:
         self.realm = realm
         self.schemes = config.login.schemes or schemes
@@ -43,8 +46,7 @@ class Login:
         self._lock = threading.Lock()
         self._nonces: OrderedDict[str, float] = OrderedDict()  # nonce -> when it was given
         self._connections: deque[float] = deque()
-        self._wrong_in_a_row = 0
-        self._locked_until = float("-inf")
+        self._lockout = lockout or Lockout(config, clock)
 
     def blocked(self, faults: FaultConfig) -> tuple[str, ...] | None:
         """Notes a connection; None unless it is one too many or the camera is locked, else the
@@ -55,7 +57,7 @@ class Login:
             while self._connections[0] < now - CAP_WINDOW_S:
                 self._connections.popleft()
             capped = faults.connection_cap and len(self._connections) > faults.connection_cap
-            return self._challenges(now) if capped or now < self._locked_until else None
+            return self._challenges(now) if capped or self._lockout.locked() else None
 
     def refused(
         self, authorization: str | None, method: str, url: str, faults: FaultConfig
@@ -74,18 +76,12 @@ class Login:
             elif kind.lower() in self.schemes:
                 right, fresh = self._digest(rest, method, url, now, faults)
             if right and fresh:
-                self._wrong_in_a_row = 0
+                self._lockout.right()
                 return None
             if not right:
-                self._count_wrong(faults, now)
+                self.rejected += 1
+                self._lockout.wrong(faults)
             return self._challenges(now, stale=right)
-
-    def _count_wrong(self, faults: FaultConfig, now: float) -> None:
-        self.rejected += 1
-        self._wrong_in_a_row += 1
-        if faults.lockout_after and self._wrong_in_a_row >= faults.lockout_after:
-            self._locked_until = now + self._config.login.lockout_s
-            self._wrong_in_a_row = 0
 
     def _challenges(self, now: float, stale: bool = False) -> tuple[str, ...]:
         found = []

@@ -16,6 +16,11 @@ class Leg:
     speed: float  # units/s
     acceleration: float = float("inf")  # units/s^2
 
+    @classmethod
+    def standing(cls, position: float, now: float) -> Leg:
+        """No move at all."""
+        return cls(position, position, now, 1.0)
+
     @property
     def distance(self) -> float:
         return abs(self.goal - self.start)

@@ -21,10 +21,13 @@ _EPOCH = datetime(2024, 5, 1, 12)
 def hunting(frame: np.ndarray, moment: float) -> np.ndarray:
     """Out of focus and back: the focal length breathes as the picture blurs."""
     off = (1 + sin(2 * pi * moment / HUNT_PERIOD_S)) / 2
-    sigma = HUNT_BLUR_PX * off * frame.shape[1] / HUNT_WIDTH
-    if sigma > 0.1:
-        frame = cv2.GaussianBlur(frame, (0, 0), sigma)
+    frame = blurred(frame, HUNT_BLUR_PX * off * frame.shape[1] / HUNT_WIDTH)
     return crop(frame, 1 + HUNT_BREATH * off)
+
+
+def blurred(frame: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Out of focus; no more than can be seen is computed."""
+    return cv2.GaussianBlur(frame, (0, 0), sigma_px) if sigma_px > 0.1 else frame
 
 
 def shaken(frame: np.ndarray, sigma_px: float, seed: list[int]) -> np.ndarray:

@@ -37,6 +37,7 @@ class Dialect(Protocol):
     - `needs_login(request) -> bool`: False for a request that is open to all, or whose login it
       checks itself;
     - `rejected_logins`: how many it found wrong where it checks them itself;
+    - `lockout`: the Lockout that counts these, where it checks them itself;
     - `report_units_per_deg`: pan's and tilt's, where it tells positions more coarsely than the
       head's motors step.
     """
@@ -70,7 +71,8 @@ class DeviceServer:
         self.fingerprint: str | None = None  # SHA-256 of its certificate, hex; None: no TLS
         self.stopping = threading.Event()
         schemes = getattr(dialect, "schemes", ("basic",))
-        self.login = Login(camera.config, dialect.realm, schemes, clock)
+        lockout = getattr(dialect, "lockout", None)
+        self.login = Login(camera.config, dialect.realm, schemes, clock, lockout)
         camera.on_faults.append(self._follow_faults)
 
     @property

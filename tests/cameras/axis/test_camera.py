@@ -13,6 +13,7 @@ from torchptz.cameras import (
     ProtocolError,
     open_camera,
 )
+from torchptz.cameras.axis import description as about
 
 POSITION = (
     "pan=51.2891\ntilt=46.1914\nzoom=1\niris=6427\nfocus=8265\nbrightness=4999\n"
@@ -121,6 +122,27 @@ class TestTranscripts:
         assert math.degrees(camera.capabilities.tilt_quantum) == pytest.approx(1 / 256)
         assert math.degrees(camera.capabilities.pan_quantum) == pytest.approx(1e-4)
 
+    def test_a_coarse_step_is_believed_after_a_command_beside_it(self, fake):
+        def reads(pan):
+            fake.state.told["position"] = f"pan={pan}\ntilt=1.5000\nzoom=1"
+            camera.position()
+            return math.degrees(camera.capabilities.pan_quantum)
+
+        camera = fake.camera()
+        camera.connect()
+        camera._readings["pan"].clear()
+        assert [reads(pan) for pan in ("0", "10", "-7", "23")] == [pytest.approx(1 / 256)] * 4
+        camera.move(Pose(math.radians(-5.0), 0.0, 1.0))
+        assert reads("5") == pytest.approx(1 / 256)  # where it was sent: nothing is shown
+        camera.move(Pose(math.radians(-8.5), 0.0, 1.0))
+        assert reads("5") == pytest.approx(1 / 256)  # not there yet
+        assert reads("8") == pytest.approx(1.0)
+        assert reads("7.31") < 0.1
+
+    def test_a_return_that_is_off_is_none(self):
+        for told in ("0", "off", "No"):
+            assert about.returns_after({about.return_parameter(1): told}, 1) is None
+
     def test_a_move_is_one_request_with_all_axes(self, fake):
         camera = fake.camera()
         camera.connect()
@@ -178,6 +200,7 @@ class TestTranscripts:
         camera = fake.camera()
         camera.connect()
         assert camera.capabilities.zoom_limits == (1, 9999)
+        assert camera.zoom_range == (1, 19999)
         assert camera.horizontal_fov is None
         assert any("digital beyond 9999" in note for note in camera.notes)
         assert any("give max_magnification" in note for note in camera.notes)

@@ -151,9 +151,16 @@ class TestTranscripts:
         assert camera.notes == []
         with pytest.raises(MotionError, match=r"pan 171.000 deg; ask for -170 to 170 deg"):
             camera.move(pose(171, 0))
-        with pytest.raises(MotionError, match="zoom 301 units"):
-            camera.move(pose(0, 0, 301))
+        with pytest.raises(MotionError, match="zoom 421 units; ask for 10 to 420"):
+            camera.move(pose(0, 0, 421))
         assert dome.puts == []
+
+    def test_a_lens_found_beyond_the_optical_range_goes_back_there(self, make, dome):
+        camera = make(max_magnification=30)
+        camera.connect()
+        assert (camera.capabilities.zoom_limits, camera.zoom_range) == ((10, 300), (10, 420))
+        camera.move(pose(0, 0, 420))
+        assert "<absoluteZoom>420</absoluteZoom>" in dome.puts[-1][1]
 
     @pytest.mark.parametrize(("pan_deg", "azimuth"), [(0, 0), (0.04, 0), (0.1, 3599), (-180, 1800)])
     def test_the_circle_closes(self, camera, dome, pan_deg, azimuth):

@@ -232,6 +232,15 @@ class TestWrongPassword:
             camera.get("/closed")
         assert attempts(fake) == 1
 
+    def test_one_attempt_at_both_ports(self, device, http_reply):
+        fakes = [device(lambda _: http_reply(401, headers=(BASIC,))) for _ in range(2)]
+        camera = connect(fakes[0].address)
+        other = camera.at_port(int(fakes[1].address.rpartition(":")[2]))
+        for call in (camera.get, other.get_picture):
+            with pytest.raises(AuthenticationError, match="refuses the credentials"):
+                call("/")
+        assert [attempts(fake) for fake in fakes] == [1, 0]
+
     def test_amid_repeats(self, device, http_reply):
         fake = device(in_turn(http_reply(503), http_reply(401, headers=(BASIC,))))
         with pytest.raises(AuthenticationError):
@@ -301,6 +310,31 @@ class TestLimitOfConnections:
             with pytest.raises(AuthenticationError, match="password was changed"):
                 camera.get("/")
         assert gate.refused == 3
+
+    def test_a_first_login_whose_nonce_alone_was_refused(self, device, http_reply):
+        digest = 'WWW-Authenticate: Digest realm="x", nonce="{}", qop="auth"{}'
+        first = http_reply(401, headers=(digest.format("a", ""),))
+        stale = http_reply(401, headers=(digest.format("b", ", stale=true"),))
+        fake = device(in_turn(first, stale, http_reply(200, b"in")))
+        assert connect(fake.address).get("/").body == b"in"
+        fake = device(in_turn(first, stale))
+        with pytest.raises(AuthenticationError, match=r"refuses the cred.*limit of connections"):
+            connect(fake.address).get("/")
+        assert attempts(fake) == 2
+
+    @pytest.mark.parametrize(("free_again", "tried"), [(True, 2), (False, 2)])
+    def test_where_even_the_open_page_is_refused(self, device, http_reply, free_again, tried):
+        full = http_reply(401, headers=(BASIC,))
+        replies = [http_reply(200, b"open"), full, full, full]
+        fake = device(in_turn(*replies, http_reply(200, b"in") if free_again else full))
+        camera = connect(fake.address)
+        camera.get("/open")
+        if free_again:
+            assert camera.get("/").body == b"in"
+        else:
+            with pytest.raises(AuthenticationError, match="limit of connections"):
+                camera.get("/")
+        assert attempts(fake) == tried
 
     def test_without_a_challenge_before_the_first_login(self, device, http_reply):
         challenge = http_reply(401, headers=(BASIC,))

@@ -1,3 +1,6 @@
+import threading
+import time
+
 import cv2
 import numpy as np
 import pytest
@@ -135,3 +138,35 @@ class TestLimits:
         huge = picture[: at + 5] + b"\xff\xff\xff\xff" + picture[at + 9 :]
         with pytest.raises(DamagedPicture, match="65535 x 65535"):
             decode_jpeg(huge)
+
+    def test_too_few_bytes_for_so_many_pixels(self, jpeg, monkeypatch):
+        small = jpeg.encode(np.zeros((16, 16, 3), np.uint8))
+        assert decode_jpeg(small).shape == (16, 16, 3)
+        monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("was decoded"))
+        at, side = small.index(b"\xff\xc0") + 5, (4800).to_bytes(2, "big")
+        with pytest.raises(DamagedPicture, match="cannot be a picture of 4800 x 4800 pixels"):
+            decode_jpeg(small[:at] + side + side + small[at + 4 :])
+
+    def test_no_more_than_two_pictures_are_decoded_at_once(self, picture, monkeypatch):
+        now, most, real = [], [0], cv2.imdecode
+
+        def counted(*args):
+            now.append(1)
+            most[0] = max(most[0], len(now))
+            time.sleep(0.02)
+            now.pop()
+            return real(*args)
+
+        monkeypatch.setattr(cv2, "imdecode", counted)
+        threads = [threading.Thread(target=decode_jpeg, args=(picture,)) for _ in range(6)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert most == [2]
+
+    def test_a_picture_is_decoded_once_where_its_corner_is_not_grey(self, jpeg, monkeypatch):
+        calls, real = [], cv2.imdecode
+        monkeypatch.setattr(cv2, "imdecode", lambda *args: calls.append(1) or real(*args))
+        decode_jpeg(jpeg.encode(jpeg.texture(48, 64)))
+        assert len(calls) == 1

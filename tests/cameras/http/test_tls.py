@@ -94,6 +94,7 @@ class TestTrust:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             transport = connect(camera.address, Tls(verify=False))
+            assert not caplog.records  # nothing was done yet
             assert [transport.get("/").body for _ in range(2)] == [b"in"] * 2
         said = [r for r in caplog.records if r.levelno >= logging.WARNING]
         assert [r.getMessage() for r in said] == [

@@ -67,6 +67,18 @@ class TestPositions:
         camera.position()
         assert camera.capabilities.pan_quantum == pytest.approx(math.radians(0.01))
 
+    def test_whole_degrees_are_a_step_only_after_a_command_beside_them(self, odd):
+        odd.answers["GetStatus"] = status(f'x="0" y="0" space="{DEGREES}"')
+        odd.answers["AbsoluteMove"] = ""
+        camera = odd.open()
+        camera.connect()
+        assert camera.capabilities.pan_quantum == 0  # a printer that leaves zeros out says so too
+        camera.move(Pose(math.radians(-3.4), math.radians(-5.0), 0.0))
+        odd.answers["GetStatus"] = status(f'x="3" y="5" space="{DEGREES}"')
+        camera.position()
+        can = camera.capabilities
+        assert (math.degrees(can.pan_quantum), can.tilt_quantum) == (pytest.approx(1.0), 0)
+
     def test_whole_numbers_say_nothing_of_a_generic_step(self, odd):
         odd.answers["GetConfigurationOptions"] = spaces(
             space(GENERIC, (-1, 1), (-1, 1)), zoom_space()
@@ -251,6 +263,7 @@ class TestChoices:
         camera.connect()
         port = "8899" if keep else odd.address.rpartition(":")[2]
         assert camera._pictures.address == f"127.0.0.1:{port}"
+        assert camera._pictures._login is camera._transport._login  # one wrong password for both
         assert camera._picture_path == "/snap?user=a&n=1"
         assert any("192.168.1.9" in note for note in camera.notes)
 

@@ -64,9 +64,11 @@ class TestSRGTranscript:
         np.testing.assert_allclose(head.pan_limits, rad(-170, 170))
         np.testing.assert_allclose(head.tilt_limits, rad(-90, 30))  # 90 up: ours grow downward
         assert head.pan_quantum == pytest.approx(math.radians(1 / 512))
-        assert head.zoom_limits == (0, 0x4000)
+        assert (head.zoom_limits, camera.zoom_range) == ((0, 0x4000), (0, 0x7AC0))
         assert head.reports_motion
-        assert head.scale_sigma == (0, 0)
+        # its unit is inferred from this very reply: pictures are asked
+        assert head.scale_sigma == (0.02, 0.02)
+        assert head.tilt_zero_sigma == pytest.approx(math.radians(2))
 
     def test_position(self, script):
         camera = connected(SonySRGCamera, script({"ptzf": SRG_PTZF}))
@@ -112,6 +114,12 @@ class TestSixteenBits:
         np.testing.assert_allclose(head.pan_limits, rad(-7727 * 0.022, 7727 * 0.022))
         np.testing.assert_allclose(head.tilt_limits, rad(-0x470 * 0.022, 4094 * 0.022))
         assert camera.at_rest() is None
+
+    def test_units_as_configured_are_believed(self, script):
+        options = {"degrees_per_unit": 0.002, "scale_sigma": 0.0}
+        head = connected(SonySRGCamera, script({"ptzf": SRG_PTZF}), **options).capabilities
+        assert math.degrees(head.pan_quantum) == pytest.approx(0.002)
+        assert head.scale_sigma == (0, 0)
 
     def test_negative_numbers_are_padded_with_f(self, script):
         fake = script({"ptzf": RX_PTZF})

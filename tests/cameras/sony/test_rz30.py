@@ -369,7 +369,7 @@ class TestSecurity:
         state = rz30.state
         state.replies = [b"", http_reply(503), http_reply(200, b"906002FF")]
         shown = repr(camera)
-        for call in (camera.position, lambda: camera.magnification(-1), camera.prepare):
+        for call in (camera.position, lambda: camera.magnification(-99), camera.prepare):
             if call == camera.prepare:
                 state.replies = [http_reply(200, b"?")] * 4 + [http_reply(400)] * 3
             with pytest.raises(CameraError) as caught:

@@ -133,6 +133,13 @@ class TestLogin:
         assert not device.post(STATUS, token()).ok
         assert device.fleet._servers["dome"].dialect.rejected_logins == 2
 
+    def test_wrong_tokens_and_wrong_digests_are_counted_together(self, wire):
+        device = wire({"lockout_after": 2}, auth="either")
+        assert not device.post(STATUS, token("wrong")).ok
+        assert device.post(STATUS, auth=HTTPDigestAuth("admin", "wrong")).status_code == 401
+        assert not device.post(STATUS, token()).ok
+        assert not device.post(STATUS, auth=HTTPDigestAuth("admin", "secret")).ok
+
     @pytest.mark.parametrize(
         ("auth", "by_token", "by_digest", "by_both"),
         [

@@ -7,9 +7,7 @@ does not tell whether the head moves.
 
 from __future__ import annotations
 
-import logging
 import math
-import time
 from dataclasses import replace
 from functools import partial
 from urllib.parse import urlencode
@@ -17,7 +15,9 @@ from urllib.parse import urlencode
 import numpy as np
 
 from ..base import BadPicture, Credentials, Pose, ProtocolError
-from ..driver import Driver, signed
+from ..coarse_grid import CoarseGrid
+from ..driver import Driver, check_options, signed
+from ..focus import settled
 from ..http.tls import Tls
 from ..http.transport import CameraTransport, Reply
 from ..switches import switch
@@ -26,13 +26,10 @@ from . import description as about
 from . import parameters as vapix
 from .channel import OTHER_CAMERA, VapixChannel
 
-logger = logging.getLogger(__name__)
-
 _PICTURE = "/axis-cgi/jpg/image.cgi"
 _USUAL_MAGNIFICATION = 20.0
 _COMPRESSION = 10  # of 0..100: hardly any blocks around bright edges
 _FASTEST = "100"
-_FOCUS_POLL_S = 0.2
 _MOST_READINGS = 64  # kept to find the step of an axis
 _NO_HEAD = "give the address of a camera whose head turns, or remove this one from the fleet"
 
@@ -68,21 +65,15 @@ class AxisCamera(Driver):
         connect_timeout_s: float = 3.0,
         read_timeout_s: float = 10.0,
     ) -> None:
-        for option, sign in (("pan_sign", pan_sign), ("tilt_sign", tilt_sign)):
-            if sign not in (-1, 1, None):
-                raise ValueError(f"camera {name}: {option} must be 1 or -1, not {sign!r}")
-        if not (isinstance(camera, int) and camera >= 1):
-            raise ValueError(f"camera {name}: camera must be 1 or more, not {camera!r}")
-        if resolution is not None and vapix.sizes(resolution) != [resolution]:
-            raise ValueError(
-                f"camera {name}: resolution must be like 1920x1080, not {resolution!r}"
-            )
-        if not isinstance(pause_return, bool):
-            raise ValueError(f"camera {name}: pause_return must be true or false")
-        if max_magnification is not None and not max_magnification > 1:
-            raise ValueError(f"camera {name}: max_magnification must be more than 1")
-        if horizontal_fov_deg is not None and not 0 < horizontal_fov_deg < 180:
-            raise ValueError(f"camera {name}: horizontal_fov_deg must be within 0 and 180")
+        sized = resolution is None or vapix.sizes(resolution) == [resolution]
+        check_options(
+            name,
+            ("camera", camera, isinstance(camera, int) and camera >= 1),
+            ("resolution", resolution, sized),
+            ("pause_return", pause_return, isinstance(pause_return, bool)),
+            ("max_magnification", max_magnification, (max_magnification or 2) > 1),
+            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
+        )
         transport = CameraTransport(
             name,
             address,
@@ -91,9 +82,8 @@ class AxisCamera(Driver):
             connect_timeout_s=connect_timeout_s,
             read_timeout_s=read_timeout_s,
         )
-        super().__init__(name, transport)
+        super().__init__(name, transport, (pan_sign, tilt_sign))
         self._channel = VapixChannel(transport, camera)
-        self._signs = pan_sign, tilt_sign
         self._camera, self._source = camera, camera - 1  # channels count from 1, sources from 0
         self._resolution, self._listed = resolution, []
         self._pause_return = pause_return
@@ -101,6 +91,7 @@ class AxisCamera(Driver):
         self._focus_wait_s = focus_wait_s
         self._turned = False  # the device turns its pictures unless it is told not to
         self._readings: dict[str, set[str]] = {"pan": set(), "tilt": set()}
+        self._grids = {"pan": CoarseGrid(), "tilt": CoarseGrid()}
 
     # ---- what the device is
 
@@ -118,11 +109,11 @@ class AxisCamera(Driver):
         self._adopt(self._channel.query("limits"))
         self._turned = about.turned_by(appearance, self._source) is not None
         for warning in about.warnings(ptz, appearance, self._camera, self._source):
-            self._note(warning)
+            self.note(warning)
         seconds = about.returns_after(ptz, self._camera)
         if seconds is not None and not self._pause_return:
             parameter = about.return_parameter(self._camera)
-            self._note(
+            self.note(
                 f"it turns away by itself after {seconds} s without a command ({parameter}): set "
                 "that to 0, or let pause_return do it"
             )
@@ -138,14 +129,15 @@ class AxisCamera(Driver):
         self.axes = signed(about.head_axes(ranges["Pan"], ranges["Tilt"]), *self._signs)
         low, high = ranges["Zoom"]
         if high > about.OPTICAL_END:
-            self._note(f"its zoom is digital beyond {about.OPTICAL_END}: that part is not used")
+            self.note(f"its zoom is digital beyond {about.OPTICAL_END}: that part is not used")
         fov, magnification = vapix.field_angles(limits) or (None, None)
         if magnification is None and self._max_magnification is None:
-            self._note(
+            self.note(
                 f"it does not tell its magnification: {_USUAL_MAGNIFICATION:g} is assumed; give "
                 "max_magnification from its data sheet"
             )
         most = self._max_magnification or magnification or _USUAL_MAGNIFICATION
+        self._whole_zoom = low, high
         self.zoom_curve = ZoomCurve.guess((low, min(high, float(about.OPTICAL_END))), most)
         self.horizontal_fov = fov if self._fov_deg is None else math.radians(self._fov_deg)
 
@@ -154,7 +146,7 @@ class AxisCamera(Driver):
         if self._resolution is None:
             self._resolution = vapix.largest(self._listed)
             if self._resolution is None:
-                self._note("it lists no sizes of pictures: its own setting is used; keep it")
+                self.note("it lists no sizes of pictures: its own setting is used; keep it")
         elif self._listed and self._resolution not in self._listed:
             raise self._transport.error(
                 ProtocolError, f"has no pictures of {self._resolution}", self._other_size()
@@ -170,6 +162,8 @@ class AxisCamera(Driver):
         returns before it arrives. Raises MotionError before anything is sent, see device_units().
         """
         pan, tilt, zoom = self.device_units(pose)
+        self._grids["pan"].sent(pan)
+        self._grids["tilt"].sent(tilt)
         target = {"pan": _degrees(pan), "tilt": _degrees(tilt), "zoom": f"{zoom:.0f}"}
         if self._turned:
             target["imagerotation"] = "0"
@@ -186,20 +180,22 @@ class AxisCamera(Driver):
                     "use a camera that tells where it points: others cannot be calibrated",
                 )
         pan, tilt, zoom = (self._channel.number(axis, told) for axis in ("pan", "tilt", "zoom"))
-        self._learn_step("pan", told["pan"])
-        self._learn_step("tilt", told["tilt"])
+        self._learn_step("pan", told["pan"], pan)
+        self._learn_step("tilt", told["tilt"], tilt)
         # Some count pan from 0 to 360 although their limits do not.
         middle = sum(self._known()[0].pan.limits) / 2
         return self.pose_of(pan - 360 * round((pan - middle) / 360), tilt, zoom)
 
-    def _learn_step(self, axis: str, printed: str) -> None:
-        readings, axes = self._readings[axis], self._known()[0]
-        if printed in readings or len(readings) >= _MOST_READINGS:
-            return
-        readings.add(printed)
-        step = vapix.step_of(readings)
-        if step != getattr(axes, axis).quantum:
-            self.axes = replace(axes, **{axis: replace(getattr(axes, axis), quantum=step)})
+    def _learn_step(self, what: str, printed: str, read: float) -> None:
+        readings, axes, grid = self._readings[what], self._known()[0], self._grids[what]
+        grid.reads(read)
+        if len(readings) < _MOST_READINGS:
+            readings.add(printed)
+        axis, step = getattr(axes, what), vapix.step_of(readings)
+        if not grid.shows(step, axis.scale):
+            step = vapix.STEP_OF_UNIT
+        if step != axis.quantum:
+            self.axes = replace(axes, **{what: replace(axis, quantum=step)})
 
     # ---- pictures
 
@@ -223,16 +219,13 @@ class AxisCamera(Driver):
         if "autofocus" not in self._channel.query("position"):
             return None
         self._channel.command(autofocus="on")
-        deadline, before = time.monotonic() + self._focus_wait_s, None
-        while (left := deadline - time.monotonic()) > 0:
-            time.sleep(min(_FOCUS_POLL_S, left))
-            now = self._channel.query("position").get("focus")
-            if now is not None and now == before:
-                break
-            before = now
+        focus = settled(self._focus, self._focus_wait_s)
         self._channel.command(autofocus="off")
-        logger.debug("%s: focus locked at %s", self._transport.label, before)
-        return None if before is None else float(before)
+        return focus
+
+    def _focus(self) -> float | None:
+        told = self._channel.query("position")
+        return self._channel.number("focus", told) if "focus" in told else None
 
     def set_focus(self, focus: float) -> None:
         """Go to a focus that focus_once() returned, and stay there."""
@@ -262,7 +255,7 @@ class AxisCamera(Driver):
 
     def _lock_focus(self, told: dict[str, str]) -> None:
         if "autofocus" not in told:
-            self._note("its focus cannot be locked from here: set it by hand, and to manual")
+            self.note("its focus cannot be locked from here: set it by hand, and to manual")
             return
         if told["autofocus"] == "on":
             self.remember("focus", lambda: self._channel.command(autofocus="on"))
@@ -278,10 +271,6 @@ class AxisCamera(Driver):
 
         undo = partial(self._channel.update, parameter, before)
         switch(self, parameter, change, undo, f"set it to {value}, it is {before}")
-
-    def _note(self, text: str) -> None:
-        if text not in self.notes:
-            self.notes.append(text)
 
 
 def _degrees(units: float) -> str:

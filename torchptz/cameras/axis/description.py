@@ -8,7 +8,7 @@ from ..axes import Axis, HeadAxes
 from . import parameters as vapix
 
 OPTICAL_END = 9999  # zoom units; beyond them the zoom is digital
-_NONE = ("", "0")
+_NONE = ("", "0", "off", "no")
 
 
 def identity(brand: dict[str, str], properties: dict[str, str]) -> str:
@@ -76,7 +76,7 @@ def head_axes(pan: tuple[float, float], tilt: tuple[float, float]) -> HeadAxes:
 def returns_after(ptz: dict[str, str], camera: int) -> str | None:
     """s without a command, after which it turns away by itself; None: it stays."""
     seconds = ptz.get(return_parameter(camera), "0")
-    return None if seconds in _NONE else seconds
+    return None if seconds.lower() in _NONE else seconds
 
 
 def return_parameter(camera: int) -> str:
@@ -86,7 +86,7 @@ def return_parameter(camera: int) -> str:
 def turned_by(appearance: dict[str, str], source: int) -> str | None:
     """deg, by which its pictures are set to turn; None: they are not."""
     rotation = appearance.get(f"Image.I{source}.Appearance.Rotation", "0")
-    return None if rotation in _NONE else rotation
+    return None if rotation.lower() in _NONE else rotation
 
 
 def warnings(

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..axes import Axis, HeadAxes
 from ..base import BadPicture, Credentials, Pose, ProtocolError
-from ..driver import Driver, signed
+from ..driver import Driver, check_options, signed
 from ..http.safe_xml import local, text_of
 from ..http.tls import Tls
 from ..http.transport import CameraTransport, Reply
@@ -66,14 +66,13 @@ class HikvisionCamera(Driver):
         horizontal_fov_deg: float | None = None,
         focus_wait_s: float = 3.0,
     ) -> None:
-        for option, value, good in (
+        check_options(
+            name,
             ("channel", channel, isinstance(channel, int) and channel >= 1),
             ("precise", precise, isinstance(precise, bool)),
             ("max_magnification", max_magnification, (max_magnification or 2) > 1),
             ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
-        ):
-            if not good:
-                raise ValueError(f"camera {name}: {option} cannot be {value!r}")
+        )
         transport = CameraTransport(
             name,
             address,
@@ -82,9 +81,9 @@ class HikvisionCamera(Driver):
             connect_timeout_s=connect_timeout_s,
             read_timeout_s=read_timeout_s,
         )
-        super().__init__(name, transport)
+        super().__init__(name, transport, (pan_sign, tilt_sign))
         self._isapi = Isapi(transport)
-        self._signs, self._precise = (pan_sign, tilt_sign), precise
+        self._precise = precise
         self._optical = max_magnification
         if horizontal_fov_deg is not None:
             self.horizontal_fov = math.radians(horizontal_fov_deg)
@@ -118,12 +117,12 @@ class HikvisionCamera(Driver):
             )
         )
         self.axes = signed(HeadAxes(_azimuth(pans), _elevation(tilts)), *self._signs)
-        self.zoom_curve = self._curve(zooms)
+        self.zoom_curve, self._whole_zoom = self._curve(zooms), zooms
         self.position()
         park = self._isapi.get_if_known(f"{self._ptz}/parkaction")
         if park is not None and text_of(park, "enabled") == "true":
             seconds = text_of(park, "Parktime")
-            self.notes.append(
+            self.note(
                 f"turns away by itself after {seconds} s without commands: switch its park "
                 "action off"
             )
@@ -146,7 +145,7 @@ class HikvisionCamera(Driver):
         if self._optical is not None:
             longest = min(longest, round(widest * self._optical))
         elif longest > widest:
-            self.notes.append(
+            self.note(
                 f"does not tell where its optical zoom ends: if that is before {longest / 10:g}x, "
                 "give max_magnification"
             )
@@ -163,9 +162,9 @@ class HikvisionCamera(Driver):
         """
         azimuth, elevation, zoom = self.device_units(pose)
         if self._precise:
-            self._isapi.put(f"{self._ptz}/absoluteEx", self._precisely(pose, zoom))
+            self._isapi.move(f"{self._ptz}/absoluteEx", self._precisely(pose, zoom))
         else:
-            self._isapi.put(
+            self._isapi.move(
                 f"{self._ptz}/absolute",
                 f"<PTZData><AbsoluteHigh><elevation>{round(elevation)}</elevation>"
                 f"<azimuth>{self._wrapped(round(azimuth))}</azimuth>"

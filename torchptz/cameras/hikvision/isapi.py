@@ -1,7 +1,7 @@
 """ISAPI, Hikvision's XML over HTTP: documents asked for and sent, refusals in words.
 
 Namespaces differ by firmware and are not looked at. A refusal is a ResponseStatus, of any HTTP
-status. After a device error the device may take the next valid command for granted and not obey
+status. After a device error the device may take the next valid position for granted and not obey
 it: so that one is sent twice, which for a target does no more than once.
 """
 
@@ -61,17 +61,17 @@ class Isapi:
             logger.debug("%s (taken for not known)", error)
             return None
 
+    def move(self, path: str, document: str) -> None:
+        """Send a position to go to, as put() does; after a device error twice."""
+        if self._after_error:
+            self.put(path, document)
+        self.put(path, document)
+        self._after_error = False
+
     def put(self, path: str, document: str = "", *, repeatable: bool = True) -> None:
         """Send a document; a busy device is asked again, a few times."""
         if document and not document.lstrip().startswith("<?xml"):
             document = _DECLARATION + document
-        twice = self._after_error and repeatable
-        for _ in range(2 if twice else 1):
-            self._put_patiently(path, document, repeatable)
-        if twice:
-            self._after_error = False
-
-    def _put_patiently(self, path: str, document: str, repeatable: bool) -> None:
         for _ in range(_BUSY_ATTEMPTS):
             if self._send(path, document, repeatable) != _BUSY:
                 return

@@ -140,8 +140,10 @@ class Login:
     The first request goes without credentials; the challenge that it brings decides on Digest,
     or else Basic. While the credentials are not **proven**, they are sent only in answer to a
     challenge just received, so that a 401 to them means that they are wrong: the camera is left
-    alone. Proven are they once a request passes with them that did not without; from then on
-    they go with each request, and a 401 may mean that
+    alone. (Unless it says that the nonce alone was refused, or once_more() tells of another
+    reason: then they are sent a second time, after a pause.) Proven are they once a request
+    passes with them that did not without; from then on they go with each request, and a 401 may
+    mean that
 
     - the nonce is used up (the challenge has another one): the request is sent again at once;
     - the camera is at its limit of connections, or its password was changed, which look alike:
@@ -157,6 +159,7 @@ class Login:
         self._fresh = self._sent_fresh = False  # the challenge has not been answered yet
         self._proven = False
         self._refusals = 0  # in a row
+        self.stopped: Refusal | None = None  # why the camera is left alone by now
 
     def header(self, method: str, target: str, body: bytes) -> str | None:
         """The value of Authorization for a request; None where it goes without."""
@@ -193,15 +196,20 @@ class Login:
         if self._credentials is None:
             cause = "asks for a user name and password (401) and none are given"
             return self._give_up(cause, "give its credentials and open it again")
+        challenges = parse_challenges(header)
+        offered = self._choose(challenges)
         if sent and not self._proven:
+            self._take(offered)
+            self._refusals += 1
+            # It says itself that it refuses the nonce, and the password is right.
+            if offered is not None and offered.stale and self._refusals == 1:
+                return self._pause_s
             cause = "refuses the credentials (401)"
             way_out = (
                 "correct them and open it again; if they are right, it may be at its limit of "
                 "connections: close other clients"
             )
             return self._give_up(cause, way_out)
-        challenges = parse_challenges(header)
-        offered = self._choose(challenges)
         if not sent and challenges:
             return self._begin(challenges, offered)
         renewed = self._take(offered)
@@ -212,6 +220,12 @@ class Login:
         if self._refusals < MOST_REFUSALS:
             return self._pause_s * 2 ** (self._refusals - 1)
         return self._limit_or_change(sent)
+
+    def once_more(self) -> float:
+        """Instead of a refusal, where something else is known to be behind it: s to wait before
+        the credentials are sent again, once, as if they had not been."""
+        self._refusals, self._fresh = 0, True
+        return self._pause_s
 
     def hides(self, text: str) -> bool:
         """Whether a text holds the password, plain or as Basic sends it."""

@@ -1,13 +1,16 @@
 """Decoding a JPEG only if all of it is there."""
 
 import re
+import threading
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 MAX_BYTES = 32 * 2**20
-MAX_PIXELS = 64 * 10**6
+MAX_PIXELS = 24 * 10**6
+_LEAST_BYTES_PER_PIXEL = 0.005  # an evenly grey JPEG has 0.006 at least
+_AT_ONCE = threading.Semaphore(2)  # decoded pictures in the making, of all cameras together
 
 _EOI, _SOS, _DRI = 0xD9, 0xDA, 0xDD
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the rest are tables
@@ -46,14 +49,21 @@ def decode_jpeg(
     if len(data) > max_bytes:
         raise DamagedPicture(f"{len(data)} bytes are over the limit of {max_bytes}")
     end, frame = _follow_markers(data, max_pixels)
-    image = _decode(data)
-    if image is None or image.shape[:2] != (frame.height, frame.width):
-        raise DamagedPicture("the decoder refuses the data")
-    # Blocks that never came decode to exactly 128. So may a real grey corner; but only where
-    # blocks are missing does the decoder go on to use bits that are added at the end.
-    corner_is_grey = bool(np.all(image[-4:, -4:] == 128))
-    if corner_is_grey and not np.array_equal(image, _decode(data[:end] + _FILLER + b"\xff\xd9")):
-        raise DamagedPicture("blocks at the end of the picture are missing")
+    pixels = frame.width * frame.height
+    if len(data) < _LEAST_BYTES_PER_PIXEL * pixels:
+        raise DamagedPicture(
+            f"{len(data)} bytes cannot be a picture of {frame.width} x {frame.height} pixels"
+        )
+    with _AT_ONCE:
+        image = _decode(data)
+        if image is None or image.shape[:2] != (frame.height, frame.width):
+            raise DamagedPicture("the decoder refuses the data")
+        # Blocks that never came decode to exactly 128. So may a real grey corner; but only where
+        # blocks are missing does the decoder go on to use bits that are added at the end.
+        if np.all(image[-4:, -4:] == 128):
+            filled = _decode(data[:end] + _FILLER + b"\xff\xd9")
+            if not np.array_equal(image, filled):
+                raise DamagedPicture("blocks at the end of the picture are missing")
     return image
 
 

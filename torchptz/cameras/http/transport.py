@@ -5,12 +5,12 @@ pictures with status 200, and locks accounts after a few wrong passwords. All of
 so that a driver only knows its dialect.
 """
 
+import copy
 import logging
 import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
-from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -23,8 +23,9 @@ from ..base import (
     ProtocolError,
 )
 from .auth import Login, Refusal
-from .exchange import Exchange, Failure, Order, Reply, shown, target_of
+from .exchange import Exchange, Failure, Order, Reply, target_of
 from .picture import MAX_BYTES, DamagedPicture, decode_jpeg
+from .replies import BUSY, as_text, busy, status_of
 from .tls import Tls
 from .wire import parse_address
 
@@ -33,16 +34,7 @@ __all__ = ["MAX_TEXT_BYTES", "CameraTransport", "Reply"]
 logger = logging.getLogger(__name__)
 
 MAX_TEXT_BYTES = 2**18  # a recorder describes many channels
-_BUSY = 503  # too many viewers, or a motor command still in progress: passes by itself
-_LONGEST_RETRY_AFTER_S = 2.0
 _LOGIN_PAUSE = 10  # a camera's connections are freed within seconds: times pause_s
-_HINTS = {
-    400: "check that the camera's model is the one that this dialect is for",
-    403: "give the account the right to move the camera, and switch exclusive control off",
-    404: "check that the camera's model is the one that this dialect is for",
-    503: "close other viewers of this camera",
-}
-
 Result = TypeVar("Result")
 
 
@@ -80,17 +72,26 @@ class CameraTransport:
         self._attempts, self._pause_s = attempts, pause_s
         self._lock = threading.Lock()
         self._login = Login(credentials, _LOGIN_PAUSE * pause_s)
+        self._tls, self._timeouts = tls, (connect_timeout_s, read_timeout_s)
         try:
-            self._exchange = Exchange(self.address, tls, (connect_timeout_s, read_timeout_s))
+            self._exchange = Exchange(self.address, tls, self._timeouts)
         except ValueError as error:
             raise ValueError(f"camera {name}: {error}") from None
-        self._stopped: Refusal | None = None
+        self._open: Order | None = None  # what was answered without a login
         self._closed = False
-        if tls is not None and not tls.verify:
-            logger.warning("%s: its certificate is not checked (verify: false)", self.label)
+        self._warning = tls is not None and not tls.verify  # to be said at the first request
 
     def __repr__(self) -> str:
         return f"CameraTransport({self.label})"
+
+    def at_port(self, port: int) -> "CameraTransport":
+        """Another port of the same camera: one login for both, and one request at a time."""
+        other = copy.copy(self)
+        other.address = f"{self.address.rpartition(':')[0]}:{port}"
+        other.label = self.label.replace(self.address, other.address)
+        other._exchange = Exchange(other.address, self._tls, self._timeouts)
+        other._open, other._warning = None, False
+        return other
 
     def get(self, path: str, *, repeatable: bool = True) -> Reply:
         """GET a path (with its query, already encoded); the reply's status is for the caller.
@@ -140,13 +141,13 @@ class CameraTransport:
 
     def status_error(self, reply: Reply, request: str) -> ProtocolError:
         """The exception for a reply of an unwanted status to a request, described in words."""
-        return self.error(ProtocolError, *_status(reply, request))
+        return self.error(ProtocolError, *status_of(reply, request))
 
     def refuse(self, cause: str, way_out: str) -> AuthenticationError:
         """What to raise where the device refused the login inside a reply (a SOAP fault): every
         later call raises it too, without traffic, as after a 401."""
         with self._lock:
-            self._stopped = Refusal(AuthenticationError, cause, way_out)
+            self._login.stopped = Refusal(AuthenticationError, cause, way_out)
         return self.error(AuthenticationError, cause, way_out)
 
     def close(self) -> None:
@@ -164,6 +165,9 @@ class CameraTransport:
 
     def _repeat(self, attempt: Callable[[], Result], repeatable: bool) -> Result:
         with self._lock:
+            if self._warning:
+                logger.warning("%s: its certificate is not checked (verify: false)", self.label)
+                self._warning = False
             for count in range(1, self._attempts + 1):
                 self._refuse_if_stopped()
                 try:
@@ -182,8 +186,8 @@ class CameraTransport:
     def _refuse_if_stopped(self) -> None:
         if self._closed:
             raise self.error(ConnectionFailed, "is closed", "open the camera again")
-        if self._stopped is not None:
-            stop = self._stopped
+        stop = self._login.stopped
+        if stop is not None:
             raise self.error(stop.kind, stop.cause, stop.way_out)
 
     def _ask(self, order: Order) -> Reply:
@@ -195,23 +199,36 @@ class CameraTransport:
             sent = authorization is not None
             reply = self._exchange.send(order, authorization)
             del authorization  # out of sight of those who report the variables of failing frames
+            if reply.status < 400 and not sent and (order.method == "GET" or not order.login):
+                self._open = order
             if not order.login:
                 return reply
             if reply.status != 401:
                 self._login.passed(reply.status, sent)
                 return reply
             step = self._login.refused(reply.headers.get("www-authenticate", ""), sent)
+            if isinstance(step, Refusal) and sent and self._refuses_all():
+                step = self._login.once_more()
             if isinstance(step, Refusal):
-                self._stopped = step
+                self._login.stopped = step
                 self._refuse_if_stopped()
             if step:
                 logger.info("%s: answers 401; trying again in %g s", self.label, step)
                 time.sleep(step)
 
+    def _refuses_all(self) -> bool:
+        """Whether what was answered without a login is refused now: then it is the number of
+        connections, and not the credentials. Asked once."""
+        order, self._open = self._open, None
+        try:
+            return order is not None and self._exchange.send(order, None).status == 401
+        except Failure:
+            return False
+
     def _get_text(self, order: Order) -> Reply:
         reply = self._ask(order)
-        if reply.status == _BUSY:
-            raise _busy(reply, ProtocolError, "is busy (503)")
+        if reply.status == BUSY:
+            raise busy(reply, ProtocolError, "is busy (503)")
         if not reply.complete:
             cause = f"closed the connection after {len(reply.body)} bytes of a longer answer"
             raise Failure(ConnectionFailed, cause, "check its network link", again=True)
@@ -222,15 +239,15 @@ class CameraTransport:
         if reply.status in (400, 404):  # of another size, or elsewhere: the dialect knows
             return reply
         if reply.status != 200:
-            cause, way_out = _status(reply, "the request for a picture")
-            if reply.status == _BUSY:
-                raise _busy(reply, ProtocolError, cause)
+            cause, way_out = status_of(reply, "the request for a picture")
+            if reply.status == BUSY:
+                raise busy(reply, ProtocolError, cause)
             raise Failure(ProtocolError, cause, way_out, again=False)
         way_out = "check its network link and its picture settings (JPEG, single pictures)"
         if not reply.complete:
             cause = f"closed the connection after {len(reply.body)} bytes of a longer picture"
             raise Failure(BadPicture, cause, way_out, again=True)
-        if text := _as_text(reply.body):
+        if text := as_text(reply.body):
             # A page may show the headers of the request.
             quoted = "" if self._login.hides(text) else f" but {text[:60]!r}"
             raise Failure(BadPicture, f"sent no JPEG{quoted}", way_out, again=True)
@@ -254,33 +271,3 @@ def _check(name: str, credentials: Credentials | None) -> None:
             f"camera {name}: an unprintable character in the credentials cannot be sent; choose "
             "others on the camera"
         )
-
-
-def _status(reply: Reply, request: str) -> tuple[str, str]:
-    """Cause and way out for a reply of an unwanted status."""
-    cause = f"answered {request} with status {reply.status}"
-    if 300 <= reply.status < 400:
-        try:
-            host = urlsplit(reply.headers.get("location", "")).hostname or ""
-        except ValueError:
-            host = ""
-        host = shown(host, 60)
-        way_out = f"it points to {f'the host {host}' if host else 'another path'}, which is not "
-        return cause, way_out + "followed: check its address, and whether it wants https (tls)"
-    return cause, _HINTS.get(reply.status, "see the camera's own log, or restart it")
-
-
-def _busy(reply: Reply, kind: type[CameraError], cause: str) -> Failure:
-    asked = reply.headers.get("retry-after", "")
-    wait_s = float(asked) if asked.isdecimal() else 0.0
-    wait_s = min(wait_s, _LONGEST_RETRY_AFTER_S)
-    return Failure(kind, cause, _HINTS[_BUSY], again=True, wait_s=wait_s, nothing_done=True)
-
-
-def _as_text(body: bytes) -> str:
-    """The start of a body that is text, printable and on one line; "" for a picture's bytes."""
-    head = body[:2000]
-    printable = sum(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head)
-    if printable < 0.9 * len(head):
-        return ""
-    return " ".join("".join(chr(b) if 32 <= b < 127 else " " for b in head).split())

@@ -9,17 +9,17 @@ degrees or motor steps under a generic name, and addresses of other hosts are al
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from ..axes import HeadAxes
+from ..axes import Axis, HeadAxes
 from ..base import BadPicture, CameraError, Credentials, Pose, ProtocolError
-from ..driver import Driver, signed
+from ..coarse_grid import CoarseGrid
+from ..driver import Driver, check_options, signed
 from ..http.safe_xml import find, text_of
 from ..http.tls import Tls
 from ..http.transport import CameraTransport, Reply
@@ -85,31 +85,27 @@ class OnvifCamera(Driver):
         read_timeout_s: float = 10.0,
     ) -> None:
         ranges = (pan_range_deg, tilt_range_deg)
-        for option, value, good in (
-            ("pan_sign", pan_sign, pan_sign in (-1, 1, None)),
-            ("tilt_sign", tilt_sign, tilt_sign in (-1, 1, None)),
+        check_options(
+            name,
             ("path", path, path.startswith("/")),
             ("snapshot_path", snapshot_path, (snapshot_path or "/").startswith("/")),
             ("pan_range_deg", ranges[0], _is_range(ranges[0])),
             ("tilt_range_deg", ranges[1], _is_range(ranges[1])),
             ("max_magnification", max_magnification, max_magnification > 1),
             ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
-        ):
-            if not good:
-                raise ValueError(f"camera {name}: {option} cannot be {value!r}")
-        transport_at = partial(
-            CameraTransport,
+        )
+        transport = CameraTransport(
             name,
-            credentials=credentials,
+            address,
+            credentials,
             tls=tls,
             connect_timeout_s=connect_timeout_s,
             read_timeout_s=read_timeout_s,
         )
-        super().__init__(name, transport_at(address))
-        self._transport_at: Callable[[str], CameraTransport] = transport_at
+        super().__init__(name, transport, (pan_sign, tilt_sign))
         self._channel = OnvifChannel(self._transport, path, credentials)
         self._services = OnvifServices(self._channel, self._transport)
-        self._signs, self._ranges_deg = (pan_sign, tilt_sign), ranges
+        self._ranges_deg = ranges
         self._wanted_profile = profile
         self._keep_ports = keep_ports
         self._picture_path = snapshot_path
@@ -118,6 +114,7 @@ class OnvifCamera(Driver):
         if horizontal_fov_deg is not None:
             self.horizontal_fov = math.radians(horizontal_fov_deg)
         self._decimals, self._zoom_decimals = Decimals(), Decimals()
+        self._grids = CoarseGrid(), CoarseGrid()  # of pan and tilt
         self._profile = ""  # token, escaped
         self._space: Space | None = None  # in which the device counts pan and tilt
         self._zoom_uri = ""
@@ -133,7 +130,7 @@ class OnvifCamera(Driver):
         self._channel.read_clock()
         offset_s = self._channel.clock_offset.total_seconds()
         if abs(offset_s) > _WRONG_CLOCK_S:
-            self._note(f"its clock is {offset_s:+.0f} s off, which is allowed for: set it")
+            self.note(f"its clock is {offset_s:+.0f} s off, which is allowed for: set it")
         self._services.find()
         told = self._channel.ask_if_known("tds", "GetDeviceInformation")
         if told is not None:
@@ -145,11 +142,11 @@ class OnvifCamera(Driver):
         self._imaging = OnvifImaging(self._channel, source, self._focus_wait_s)
         if self._picture_path is None:
             self._picture_path, port = self._services.picture(self._profile)
-            host, _, reached = self._transport.address.rpartition(":")
-            if self._keep_ports and port != int(reached):
-                self._pictures = self._transport_at(f"{host}:{port}")
+            reached = int(self._transport.address.rpartition(":")[2])
+            if self._keep_ports and port != reached:
+                self._pictures = self._transport.at_port(port)
         for note in self._services.notes:
-            self._note(note)
+            self.note(note)
         self._adopt_spaces(find(profile, "PTZConfiguration"))
 
     def _adopt_spaces(self, configuration: Element) -> None:
@@ -171,8 +168,8 @@ class OnvifCamera(Driver):
         self.zoom_curve = ZoomCurve.guess(zooming.x, self._max_magnification)
         self._learn_step()
         for note in notes:
-            self._note(note)
-        self._note(
+            self.note(note)
+        self.note(
             "ONVIF has no switches for digital zoom and text in the picture, and no "
             "magnification: switch both off in its settings, and give max_magnification from its "
             "data sheet"
@@ -185,6 +182,8 @@ class OnvifCamera(Driver):
         returns before it arrives. Raises MotionError before anything is sent, see device_units().
         """
         pan, tilt, zoom = self.device_units(pose)
+        for grid, units in zip(self._grids, (pan, tilt), strict=True):
+            grid.sent(units)
         # Without a zoom some devices zoom out, without pan and tilt some do nothing.
         self._channel.call(
             "tptz",
@@ -218,6 +217,8 @@ class OnvifCamera(Driver):
         self.reported_moving = status.moving
         self._decimals.see(*status.printed[:2])
         self._zoom_decimals.see(status.printed[2])
+        for grid, units in zip(self._grids, (status.pan, status.tilt), strict=True):
+            grid.reads(units)
         return status
 
     def _check_space(self, status: PtzStatus) -> None:
@@ -228,15 +229,19 @@ class OnvifCamera(Driver):
     def _learn_step(self) -> None:
         axes, curve = self._known()
         self.zoom_step = self._zoom_decimals.quantum(curve.limits, _COARSEST_ZOOM)
-        pan, tilt = (self._decimals.quantum(axis.limits) for axis in (axes.pan, axes.tilt))
+        pan, tilt = map(self._step_of, (axes.pan, axes.tilt), self._grids)
         if (pan, tilt) != (axes.pan.quantum, axes.tilt.quantum):
             self._replace(pan={"quantum": pan}, tilt={"quantum": tilt})
+
+    def _step_of(self, axis: Axis, grid: CoarseGrid) -> float:
+        step = self._decimals.quantum(axis.limits)
+        return step if self._decimals.fixed or grid.shows(step, axis.scale) else 0.0
 
     def _widen(self, what: str, reading: float) -> None:
         axis = getattr(self._known()[0], what)
         wider = widened(axis.limits, reading)
         if wider != axis.limits and not axis.circular:
-            self._note(outside_note(what, reading, axis.limits))
+            self.note(outside_note(what, reading, axis.limits))
             self._replace(**{what: {"limits": wider}})
 
     def _replace(self, **changes: dict[str, object]) -> None:
@@ -285,10 +290,6 @@ class OnvifCamera(Driver):
         """Close the connection; later calls raise ConnectionFailed."""
         super().close()
         self._pictures.close()
-
-    def _note(self, note: str) -> None:
-        if note not in self.notes:
-            self.notes.append(note)
 
 
 def _is_range(value: Sequence[float] | None) -> bool:

@@ -25,7 +25,7 @@ Call = tuple[str, str, str]  # prefix of the service, operation, content
 
 
 class OnvifChannel:
-    """The services of one device, by the prefixes of onvif_soap.NAMESPACES.
+    """The services of one device, by the prefixes of soap.NAMESPACES.
 
     Nothing secret is sent before the device asks for it: an HTTP challenge is answered by HTTP
     login, a fault NotAuthorized by a WS-UsernameToken; some devices want both. A token is stamped
@@ -120,7 +120,8 @@ class OnvifChannel:
     def _refused(self, cause: str) -> AuthenticationError:
         way_out = (
             "correct them (ONVIF users are often kept apart from the others), set its clock, "
-            "and open it again"
+            "and open it again; if they are right, it may be at its limit of connections: close "
+            "other clients"
         )
         return self._transport.refuse(f"{cause} {_ALONE}", way_out)
 

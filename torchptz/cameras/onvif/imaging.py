@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from xml.etree.ElementTree import Element
 from xml.sax.saxutils import escape
 
 from ..driver import Driver
+from ..focus import settled
 from ..http.safe_xml import find, text_of
 from ..switches import switch
 from .channel import OnvifChannel
 
-_POLL_S = 0.2
 _FOCUS_NUMBERS = ("DefaultSpeed", "NearLimit", "FarLimit")
 
 _FOCUS_BY_HAND = "set it to manual in its settings"
@@ -46,8 +45,8 @@ class OnvifImaging:
             )
             lock, undo = (partial(self._set_focus_mode, one) for one in ("MANUAL", mode))
             self.locks_focus = switch(driver, "focus", lock, undo, _FOCUS_BY_HAND)
-        elif _NO_FOCUS not in driver.notes:
-            driver.notes.append(_NO_FOCUS)
+        else:
+            driver.note(_NO_FOCUS)
         if self.locks_focus:
             options = self._channel.ask_if_known("timg", "GetMoveOptions", self._source)
             self._sets_focus = options is not None and find(options, "Absolute") is not None
@@ -61,7 +60,7 @@ class OnvifImaging:
         if not self.locks_focus:
             return None
         self._set_focus_mode("AUTO")
-        found = self._wait_for_focus()
+        found = settled(self._focus, self._wait_s)
         self._set_focus_mode("MANUAL")
         return found if self._sets_focus else None
 
@@ -73,16 +72,6 @@ class OnvifImaging:
             f"{self._source}<timg:Focus><tt:Absolute><tt:Position>{focus:.6f}</tt:Position>"
             "</tt:Absolute></timg:Focus>",
         )
-
-    def _wait_for_focus(self) -> float | None:
-        deadline = time.monotonic() + self._wait_s
-        before = now = None
-        while (left := deadline - time.monotonic()) > 0:
-            time.sleep(min(_POLL_S, left))
-            before, now = now, self._focus()
-            if now is not None and now == before:
-                break
-        return now
 
     def _focus(self) -> float | None:
         status = self._channel.ask_if_known("timg", "GetStatus", self._source)

@@ -64,14 +64,20 @@ class Decimals:
 
     def __init__(self) -> None:
         self.most = 0
+        self.fixed = False  # it fills up with zeros: so many there are always
 
     def see(self, *numbers: str) -> None:
         """Take note of numbers as they stood in a reply."""
         for number in numbers:
             try:
-                self.most = max(self.most, -Decimal(number).as_tuple().exponent)
+                decimals = -Decimal(number).as_tuple().exponent
             except (InvalidOperation, TypeError):
                 continue
+            filled = decimals > 0 and number.rstrip().endswith("0")
+            if decimals > self.most:
+                self.most, self.fixed = decimals, filled
+            elif decimals == self.most:
+                self.fixed = self.fixed or filled
 
     def quantum(self, limits: Range, coarsest: float = _COARSEST_STEP) -> float:
         """The step of a reading in units; 0 where it is too fine, or not told yet.

@@ -1,23 +1,24 @@
 """Sony network cameras that take named parameters: ``ptzf.cgi?AbsolutePanTilt=p,t,speed``.
 
 Two generations speak it. SNC-RZ25, RZ50, RX and later SNC models count in 16 bits, with units that
-differ by model; SRG and BRC models count in 20 bits, 512 units per degree, and tell whether they
-move. Both write hexadecimal two's complement, and both tell their ranges in the answer to
-``inquiry.cgi?inq=ptzf``.
+differ by model; SRG and BRC models count in 20 bits, presumably 512 units per degree, and tell
+whether they move. Both write hexadecimal two's complement, and both tell their ranges in the
+answer to ``inquiry.cgi?inq=ptzf``.
 
 Until pictures or the configuration tell otherwise, raw pan is taken to grow to the right and raw
 tilt upward, as the signed speeds of this make do; a hanging camera turns both round.
 """
 
 import math
-import time
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from ..axes import Axis, HeadAxes
 from ..base import Credentials, Pose, ProtocolError
-from ..driver import Driver, signed
+from ..driver import Driver, check_options, signed
+from ..focus import settled
 from ..http.tls import Tls
 from ..http.transport import CameraTransport
 from ..switches import switch
@@ -26,7 +27,19 @@ from .ptzf import POSITION, Format, Ptzf
 from .settings import SonyPictures, SonySettings, identity_in, switch_overlays_off
 
 _MAX_SPEED = 24
-_FOCUS_POLL_S, _FOCUS_SPEED = 0.2, 8
+_FOCUS_SPEED = 8
+_ZERO_SIGMA = math.radians(2)  # how far raw 0 may be from straight ahead and level
+
+
+@dataclass(frozen=True)
+class _Usual:
+    """What a generation is taken to be where neither options nor device tell."""
+
+    degrees_per_unit: float
+    scale_sigma: float  # relative
+    pan_range_deg: tuple[float, float]  # raw, lo < hi
+    tilt_range_deg: tuple[float, float]
+    max_magnification: float
 
 
 class _NamedCamera(Driver):
@@ -34,38 +47,55 @@ class _NamedCamera(Driver):
 
     _format: Format
     _other: str  # who counts otherwise, for messages
-    _zero_sigma: float  # rad, how far raw 0 may be from straight ahead and level
+    _usual: _Usual
 
     def __init__(
         self,
         name: str,
-        transport: CameraTransport,
-        signs: tuple[int | None, int | None],
+        address: str,
+        credentials: Credentials | None = None,
         *,
-        degrees_per_unit: float,
-        scale_sigma: float,
-        ranges_deg: tuple[tuple[float, float], tuple[float, float]],
-        max_magnification: float | None,
-        default_magnification: float,
-        horizontal_fov_deg: float | None,
-        speed: int,
-        focus_wait_s: float,
+        pan_sign: int | None = None,
+        tilt_sign: int | None = None,
+        tls: Tls | None = None,
+        connect_timeout_s: float = 3.0,
+        read_timeout_s: float = 10.0,
+        degrees_per_unit: float | None = None,
+        scale_sigma: float | None = None,
+        pan_range_deg: tuple[float, float] | None = None,
+        tilt_range_deg: tuple[float, float] | None = None,
+        max_magnification: float | None = None,
+        horizontal_fov_deg: float | None = None,
+        speed: int = _MAX_SPEED,
+        focus_wait_s: float = 3.0,
     ) -> None:
-        for option, value, good in (
+        usual = self._usual
+        degrees_per_unit = usual.degrees_per_unit if degrees_per_unit is None else degrees_per_unit
+        scale_sigma = usual.scale_sigma if scale_sigma is None else scale_sigma
+        pans = tuple(pan_range_deg or usual.pan_range_deg)
+        tilts = tuple(tilt_range_deg or usual.tilt_range_deg)
+        check_options(
+            name,
             ("degrees_per_unit", degrees_per_unit, degrees_per_unit > 0),
             ("scale_sigma", scale_sigma, scale_sigma >= 0),
-            ("pan_range_deg", ranges_deg[0], ranges_deg[0][0] < ranges_deg[0][1]),
-            ("tilt_range_deg", ranges_deg[1], ranges_deg[1][0] < ranges_deg[1][1]),
+            ("pan_range_deg", pans, pans[0] < pans[1]),
+            ("tilt_range_deg", tilts, tilts[0] < tilts[1]),
             ("max_magnification", max_magnification, (max_magnification or 2) > 1),
             ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
             ("speed", speed, isinstance(speed, int) and 1 <= speed <= _MAX_SPEED),
-        ):
-            if not good:
-                raise ValueError(f"camera {name}: {option} cannot be {value!r}")
-        super().__init__(name, transport)
-        self._signs, self._ranges_deg = signs, ranges_deg
+        )
+        transport = CameraTransport(
+            name,
+            address,
+            credentials,
+            tls=tls,
+            connect_timeout_s=connect_timeout_s,
+            read_timeout_s=read_timeout_s,
+        )
+        super().__init__(name, transport, (pan_sign, tilt_sign))
+        self._ranges_deg = pans, tilts
         self._scale, self._scale_sigma = math.radians(degrees_per_unit), scale_sigma
-        self._magnification = max_magnification or default_magnification
+        self._magnification = max_magnification or usual.max_magnification
         self._magnification_known = max_magnification is not None
         if horizontal_fov_deg is not None:
             self.horizontal_fov = math.radians(horizontal_fov_deg)
@@ -88,6 +118,8 @@ class _NamedCamera(Driver):
             told.optical_zoom or sony_zoom.OPTICAL_LIMITS,
             known=self._magnification_known,
         )
+        low, high = self.zoom_curve.limits
+        self._whole_zoom = low, max(high, told.zoom_end or high)
         self.reports_motion = told.tells_motion
         system = self._settings.ask_if_known("system")
         if "RZ30" in system.get("ModelName", "").upper():
@@ -100,7 +132,7 @@ class _NamedCamera(Driver):
     ) -> Axis:
         limits = told or tuple(round(math.radians(angle) / self._scale) for angle in believed_deg)
         if told is None:
-            self.notes.append(
+            self.note(
                 f"does not tell its range of {axis}: it is taken to be {limits[0]} to {limits[1]} "
                 f"units, see {axis}_range_deg"
             )
@@ -110,7 +142,7 @@ class _NamedCamera(Driver):
             limits=limits,
             quantum=1,
             scale_sigma=self._scale_sigma,
-            offset_sigma=self._zero_sigma,
+            offset_sigma=_ZERO_SIGMA,
         )
 
     def _ask(self) -> Ptzf:
@@ -160,26 +192,18 @@ class _NamedCamera(Driver):
         # The trigger works in manual mode; a repeat would start a second search.
         self._settings.set("ptzf", "FocusMode", "manual")
         self._settings.send(f"/command/ptzf.cgi?Move=onepushaf,{_FOCUS_SPEED}", repeatable=False)
-        focus = self._wait_for_focus()
+        focus = settled(self._focus_at_rest, self._focus_wait_s)
         self._settings.set("ptzf", "FocusMode", "manual")
-        return focus
+        return float(self._ask().focus) if focus is None else focus
 
     def set_focus(self, focus: float) -> None:
         """Go to a focus that focus_once() returned, and stay there."""
         self._settings.set("ptzf", "FocusMode", "manual")
         self._send_focus(f"{round(focus):04x}")
 
-    def _wait_for_focus(self) -> float:
-        """The focus once it stands still, or at the end of the time."""
-        deadline = time.monotonic() + self._focus_wait_s
-        now = None
-        while (left := deadline - time.monotonic()) > 0 or now is None:
-            time.sleep(max(min(_FOCUS_POLL_S, left), 0))
-            told = self._ask()
-            before, now = now, told.focus
-            if now == before and not told.focus_moving:
-                break
-        return float(now)
+    def _focus_at_rest(self) -> float | None:
+        told = self._ask()
+        return None if told.focus_moving else float(told.focus)
 
     def _send_focus(self, focus: str) -> None:
         """Only a whole pose has a focus: the last one asked for, else the one that is read."""
@@ -220,111 +244,32 @@ class SonyNamedCamera(_NamedCamera):
     """Driver of SNC-RZ25, RZ50, RX530/550/570 and later SNC models with a head (16 bits).
 
     address: "host" or "host:port". pan_sign, tilt_sign: -1 turns an axis round against the
-    module's default, 1 confirms it, None leaves it to the pictures. degrees_per_unit differs by
-    model, scale_sigma says how well it is known (0: exactly). pan_range_deg, tilt_range_deg: raw
-    ranges, of use where the firmware does not tell them. max_magnification: at the optical end;
-    None begins with the RZ25's 18 and leaves the curve to the pictures. horizontal_fov_deg: at
-    the widest zoom, from the data sheet. speed: 1..24, the device's steps. focus_wait_s: the
-    longest time that focus_once() allows the autofocus. tls, connect_timeout_s, read_timeout_s:
-    see CameraTransport.
+    module's default, 1 confirms it, None leaves it to the pictures. degrees_per_unit (0.022)
+    differs by model, scale_sigma (0.01) says how well it is known (0: exactly). pan_range_deg
+    (-170, 170), tilt_range_deg (-90, 25): raw ranges, of use where the firmware does not tell
+    them. max_magnification: at the optical end; None begins with the RZ25's 18 and leaves the
+    curve to the pictures. horizontal_fov_deg: at the widest zoom, from the data sheet. speed:
+    1..24, the device's steps. focus_wait_s: the longest time that focus_once() allows the
+    autofocus. tls, connect_timeout_s, read_timeout_s: see CameraTransport.
 
     Raises ValueError for options out of range; its methods raise CameraError subclasses.
     """
 
     _format = Format(16)
-    _zero_sigma = math.radians(2)
     _other = "SRG and BRC models count in 20 bits, with dialect sony_srg"
-
-    def __init__(
-        self,
-        name: str,
-        address: str,
-        credentials: Credentials | None = None,
-        *,
-        pan_sign: int | None = None,
-        tilt_sign: int | None = None,
-        tls: Tls | None = None,
-        connect_timeout_s: float = 3.0,
-        read_timeout_s: float = 10.0,
-        degrees_per_unit: float = 0.022,
-        scale_sigma: float = 0.01,
-        pan_range_deg: tuple[float, float] = (-170.0, 170.0),
-        tilt_range_deg: tuple[float, float] = (-90.0, 25.0),
-        max_magnification: float | None = None,
-        horizontal_fov_deg: float | None = None,
-        speed: int = _MAX_SPEED,
-        focus_wait_s: float = 3.0,
-    ) -> None:
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(
-            name,
-            transport,
-            (pan_sign, tilt_sign),
-            degrees_per_unit=degrees_per_unit,
-            scale_sigma=scale_sigma,
-            ranges_deg=(tuple(pan_range_deg), tuple(tilt_range_deg)),
-            max_magnification=max_magnification,
-            default_magnification=sony_zoom.PUBLISHED_MAGNIFICATION,
-            horizontal_fov_deg=horizontal_fov_deg,
-            speed=speed,
-            focus_wait_s=focus_wait_s,
-        )
+    _usual = _Usual(0.022, 0.01, (-170.0, 170.0), (-90.0, 25.0), sony_zoom.PUBLISHED_MAGNIFICATION)
 
 
 class SonySRGCamera(_NamedCamera):
-    """Driver of SRG and BRC models (20 bits, 512 units per degree).
+    """Driver of SRG and BRC models (20 bits).
 
-    Options as those of SonyNamedCamera; units and ranges the device's own. max_magnification:
-    None begins with 20 and leaves the curve to the pictures.
+    Options as those of SonyNamedCamera, with other defaults: 1/512 degree per unit, which is read
+    out of one published reply and known to 0.02 only until pictures tell, ranges of (-170, 170)
+    and (-30, 90), and a max_magnification that begins with 20.
 
     Raises ValueError for options out of range; its methods raise CameraError subclasses.
     """
 
     _format = Format(20)
-    _zero_sigma = 0.0
     _other = "SNC models count in 16 bits, with dialect sony_named"
-
-    def __init__(
-        self,
-        name: str,
-        address: str,
-        credentials: Credentials | None = None,
-        *,
-        pan_sign: int | None = None,
-        tilt_sign: int | None = None,
-        tls: Tls | None = None,
-        connect_timeout_s: float = 3.0,
-        read_timeout_s: float = 10.0,
-        max_magnification: float | None = None,
-        horizontal_fov_deg: float | None = None,
-        speed: int = _MAX_SPEED,
-        focus_wait_s: float = 3.0,
-    ) -> None:
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(
-            name,
-            transport,
-            (pan_sign, tilt_sign),
-            degrees_per_unit=1 / 512,
-            scale_sigma=0.0,
-            ranges_deg=((-170.0, 170.0), (-30.0, 90.0)),
-            max_magnification=max_magnification,
-            default_magnification=20.0,
-            horizontal_fov_deg=horizontal_fov_deg,
-            speed=speed,
-            focus_wait_s=focus_wait_s,
-        )
+    _usual = _Usual(1 / 512, 0.02, (-170.0, 170.0), (-30.0, 90.0), 20.0)

@@ -40,7 +40,8 @@ class Ptzf:
     text: str  # all four as they were written
     pan_range: tuple[int, int] | None  # lo < hi; None: not told
     tilt_range: tuple[int, int] | None
-    optical_zoom: tuple[int, int] | None  # the digital one goes on from there, on the same scale
+    optical_zoom: tuple[int, int] | None
+    zoom_end: int | None  # where the digital zoom ends, which goes on from there; None: not told
     tells_motion: bool
     moving: bool | None  # of head or lens; None: not told, or not known to the device
     focus_moving: bool  # False where it is not told
@@ -58,7 +59,8 @@ class Ptzf:
             ranges.append(ends and _ascending(key, [numbers.read(end) for end in ends.split(",")]))
         key = "ZoomMovementRange"
         ends = told.get(key)
-        optical = ends and _ascending(key, [int(end, 16) for end in ends.split(",")][:2])
+        zooms = [int(end, 16) for end in ends.split(",")] if ends else []
+        optical = _ascending(key, zooms[:2]) if ends else None
         status = told.get("PtzfStatus", "").split(",")
         return cls(
             numbers.read(pan),
@@ -68,6 +70,7 @@ class Ptzf:
             text,
             *ranges,
             optical,
+            max(zooms) if ends else None,
             "PtzfStatus" in told,
             _moving(status[:3]),
             "moving" in status[3:],

@@ -5,14 +5,14 @@ with raw 0 about 28 degrees below the horizon and a scale of its own on each axi
 """
 
 import math
-import time
 from functools import partial
 
 import numpy as np
 
 from ..axes import Axis, HeadAxes
 from ..base import Credentials, Pose, ProtocolError
-from ..driver import Driver, signed
+from ..driver import Driver, check_options, signed
+from ..focus import settled
 from ..http.tls import Tls
 from ..http.transport import CameraTransport
 from ..switches import switch
@@ -39,8 +39,6 @@ _DIGITAL_ZOOM_ON, _DIGITAL_ZOOM_OFF = "8101040602FF", "8101040603FF"
 _FOCUS_AUTO, _FOCUS_MANUAL, _FOCUS_ONCE = "8101043802FF", "8101043803FF", "8101041801FF"
 _STABILISER_ON, _STABILISER_OFF = "8101043402FF", "8101043403FF"
 _ON_OR_AUTO = 2  # the answer of the mode inquiries, as against 3
-
-_FOCUS_POLL_S = 0.2
 
 
 class SonyRZ30Camera(Driver):
@@ -72,12 +70,11 @@ class SonyRZ30Camera(Driver):
         tilt_speed: int = 20,
         focus_wait_s: float = 3.0,
     ) -> None:
-        for option, value in (("pan_sign", pan_sign), ("tilt_sign", tilt_sign)):
-            if value not in (-1, 1, None):
-                raise ValueError(f"camera {name}: {option} must be 1 or -1, not {value!r}")
-        for option, value, top in (("pan_speed", pan_speed, 24), ("tilt_speed", tilt_speed, 20)):
-            if not (isinstance(value, int) and 1 <= value <= top):
-                raise ValueError(f"camera {name}: {option} must be 1..{top}, not {value!r}")
+        check_options(
+            name,
+            ("pan_speed", pan_speed, isinstance(pan_speed, int) and 1 <= pan_speed <= 24),
+            ("tilt_speed", tilt_speed, isinstance(tilt_speed, int) and 1 <= tilt_speed <= 20),
+        )
         transport = CameraTransport(
             name,
             address,
@@ -86,8 +83,8 @@ class SonyRZ30Camera(Driver):
             connect_timeout_s=connect_timeout_s,
             read_timeout_s=read_timeout_s,
         )
-        super().__init__(name, transport)
-        self.axes = signed(AXES, pan_sign, tilt_sign)
+        super().__init__(name, transport, (pan_sign, tilt_sign))
+        self.axes = signed(AXES, *self._signs)
         self.zoom_curve = sony_zoom.curve(MAX_MAGNIFICATION)
         self.horizontal_fov = HORIZONTAL_FOV
         self._channel = ViscaChannel(transport)
@@ -149,24 +146,14 @@ class SonyRZ30Camera(Driver):
         # once. Manual again at the end, for firmware that returns to automatic by itself.
         self._channel.command(_FOCUS_MANUAL)
         self._channel.command(_FOCUS_ONCE, repeatable=False)
-        focus = self._wait_for_focus()
+        read = partial(self._channel.ask_if_known, _FOCUS_POSITION_INQUIRY, 4)
+        focus = settled(read, self._focus_wait_s)
         self._channel.command(_FOCUS_MANUAL)
         return focus
 
     def set_focus(self, focus: float) -> None:
         """Go to a focus that focus_once() returned, and stay there."""
         self._send(_FOCUS_MANUAL, _focus_at(round(focus)))
-
-    def _wait_for_focus(self) -> float | None:
-        """The focus once it stands still, or at the end of the time; None: not told."""
-        deadline = time.monotonic() + self._focus_wait_s
-        now = None
-        while (left := deadline - time.monotonic()) > 0:
-            time.sleep(min(_FOCUS_POLL_S, left))
-            before, now = now, self._channel.ask_if_known(_FOCUS_POSITION_INQUIRY, 4)
-            if now is not None and now == before:
-                break
-        return now
 
     # ---- state
 

@@ -8,6 +8,7 @@ from typing import Literal
 from zlib import crc32
 
 from ..camera import SimulatedCamera
+from ..lockout import Lockout
 from ..server import Reply, Request
 from .onvif_answers import OnvifAnswers
 from .onvif_auth import TokenLogin
@@ -60,7 +61,8 @@ class OnvifDevice:
             raise ValueError(f"auth cannot be {auth!r}")
         self.camera = camera
         self.auth = auth
-        self.tokens = TokenLogin(camera.config)
+        self.lockout = Lockout(camera.config)
+        self.tokens = TokenLogin(camera.config, self.lockout)
         if profile_s and space in ("degrees", "both"):
             space = "generic"
         spaces = _spaces(camera, space, pan_range, tilt_range)

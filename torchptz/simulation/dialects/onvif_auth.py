@@ -6,15 +6,14 @@ import base64
 import binascii
 import hashlib
 import hmac
-import time
 from collections import deque
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from threading import Lock
 from xml.etree.ElementTree import Element
 
 from ..config import CameraConfig
 from ..faults import FaultConfig
+from ..lockout import Lockout
 from .onvif_messages import text
 
 WINDOW_S = 5.0  # Created may be so far from the device's clock
@@ -35,14 +34,12 @@ def told_clock(faults: FaultConfig) -> datetime:
 class TokenLogin:
     """Judges WS-UsernameTokens; `rejected` counts those that were refused. Thread-safe."""
 
-    def __init__(self, config: CameraConfig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, config: CameraConfig, lockout: Lockout) -> None:
         self.rejected = 0
         self._config = config
-        self._clock = clock
+        self._lockout = lockout
         self._lock = Lock()
         self._nonces: deque[str] = deque(maxlen=NONCES_KEPT)
-        self._wrong_in_a_row = 0
-        self._locked_until = float("-inf")
 
     def accepts(self, token: Element | None, faults: FaultConfig) -> bool:
         """Whether a request with this token may enter; one without a token is no wrong login."""
@@ -51,17 +48,13 @@ class TokenLogin:
         if token is None:
             return False
         with self._lock:
-            now = self._clock()
-            if now < self._locked_until:
+            if self._lockout.locked():
                 return False
             if self._right(token, faults):
-                self._wrong_in_a_row = 0
+                self._lockout.right()
                 return True
             self.rejected += 1
-            self._wrong_in_a_row += 1
-            if faults.lockout_after and self._wrong_in_a_row >= faults.lockout_after:
-                self._locked_until = now + self._config.login.lockout_s
-                self._wrong_in_a_row = 0
+            self._lockout.wrong(faults)
             return False
 
     def _right(self, token: Element, faults: FaultConfig) -> bool:
