@@ -1,19 +1,16 @@
 """Probing of one camera, a simulated one behind a real socket."""
 
-import json
 import math
 import threading
 import time
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import replace
 
 import pytest
 
 from torchptz.cameras import CameraError, Pose, open_camera
-from torchptz.fleet import probe_fleet as module
-from torchptz.fleet.config import parse_config
+from torchptz.cameras.axes import HeadAxes
 from torchptz.fleet.probe import probe
-from torchptz.fleet.probe_fleet import probe_fleet
 from torchptz.fleet.probe_mechanics import watch_motion
 from torchptz.scanning.observation import Stopped
 from torchptz.scanning.still_pictures import Stills
@@ -157,6 +154,23 @@ class TestShort:
             assert camera.zoom_curve.max_magnification == pytest.approx(nominal, rel=0.02)
 
 
+class TestUnits:
+    def test_that_are_said_to_be_exact_and_are_not_are_learnt(self, opened):
+        body = {"dialect": "sony_srg", "image_size": (368, 272), "seed": 5}
+        with opened(body, dialect="sony_srg", device={}) as (camera, config, _):
+            true = camera.axes
+            pan, tilt = (
+                replace(axis, scale=1.03 * axis.scale, scale_sigma=0.0, offset_sigma=0.0)
+                for axis in (true.pan, true.tilt)
+            )
+            camera.learn(axes=HeadAxes(pan, tilt))
+            report = probe(camera, config, short=True)
+            assert report.passed, report.refused
+            assert sum(one.startswith("its degrees are not") for one in report.notes) == 2
+            for old, new in ((true.pan, camera.axes.pan), (true.tilt, camera.axes.tilt)):
+                assert abs(abs(new.scale / old.scale) - 1) < 3 * new.scale_sigma < 0.03
+
+
 class TestFull:
     def test_mechanics_are_measured_and_everything_is_as_it_was(self, opened):
         head = {"speed_up": 500.0, "backlash_deg": PLAY}
@@ -193,11 +207,17 @@ class TestFull:
             assert simulated.reading() == pytest.approx(begun, abs=1e-9)
             assert simulated.digital_zoom
 
-    def test_zooms_that_the_lens_does_not_have_are_refused_as_by_a_collection(self, opened):
-        with opened(zooms=[1.0, 99.0]) as (camera, config, _):
+    @pytest.mark.parametrize(
+        ("zooms", "passed"), [([1.0, 99.0], True), ([99.0], False)], ids=["one", "all"]
+    )
+    def test_zooms_that_the_lens_does_not_have_are_told_as_by_a_collection(
+        self, opened, zooms, passed
+    ):
+        with opened(zooms=zooms) as (camera, config, _):
             report = probe(camera, config)
-            assert "its lens goes to 25x, and zooms asks for 99; take" in report.refused
-            assert verdicts(report)["axes"]
+            said = " ".join(report.notes) if passed else report.refused
+            assert report.passed is passed
+            assert "its lens goes to 25x, and zooms asks for 99" in said
 
     def test_a_camera_that_goes_away_leaves_a_note_of_where_it_was(self, opened, monkeypatch):
         with opened() as (camera, config, simulated):
@@ -238,72 +258,38 @@ class TestMotionFlag:
             assert text in check.text
 
 
-class TestFleet:
-    def test_a_bad_camera_is_refused_and_stops_no_other(self, start_fleet, tmp_path, monkeypatch):
-        # The full form has its own test.
-        monkeypatch.setattr(module, "probe", partial(probe, short=True))
-        dead = ({"faults": {"refuse_connections": True}}, QUICK)
-        with start_fleet(tmp_path, {"dead": dead, "gate": ({}, QUICK)}) as fleet:
-            reports = probe_fleet(fleet.config.cameras, tmp_path / "out")
-            assert [report.passed for report in reports.values()] == [False, True]
-            assert reports["dead"].refused.startswith("camera dead")
-            stored = json.loads((tmp_path / "out" / "gate" / "probe.json").read_text())
-            assert stored["passed"]
-            assert stored["capabilities"]["max_magnification"] == 25.0
-            assert stored["capabilities"]["pan_deg"] == [-170.0, 170.0]
-            everything = json.dumps([report.as_dict() for report in reports.values()])
-            assert not any(secret in everything for secret in fleet.secrets.values())
-
-    def test_a_folder_that_cannot_be_made_is_told_before_anything_is_sent(self, tmp_path):
-        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
-        (tmp_path / "out").write_text("in the way")
-        told = []
-        with pytest.raises(OSError, match="out"):
-            probe_fleet(
-                parse_config({"cameras": [camera]}).cameras,
-                tmp_path / "out",
-                lambda *what: told.append(what),
-            )
-        assert told == []
-
-    def test_progress_that_raises_costs_nothing_but_the_reports(self, caplog):
-        def broken(*_):
-            raise BrokenPipeError("nobody listens")
-
-        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
-        reports = probe_fleet(parse_config({"cameras": [camera]}).cameras, progress=broken)
-        assert "cannot be reached" in reports["gate"].refused
-        assert caplog.text.count("its progress cannot be reported") == 1
-
-    def test_a_report_that_cannot_be_stored_is_returned(self, tmp_path, caplog):
-        camera = {"name": "gate", "address": "127.0.0.1:9", "dialect": "sony_rz30", "zooms": [1.0]}
-        (tmp_path / "gate" / "probe.json").mkdir(parents=True)
-        reports = probe_fleet(parse_config({"cameras": [camera]}).cameras, tmp_path)
-        assert "cannot be reached" in reports["gate"].refused
-        assert "camera gate: no probe.json is written" in caplog.text
-
-
 class TestPosition:
     """A thin camera: what it reads is the point."""
 
     @pytest.mark.parametrize(
-        ("readings", "reason"),
-        [
-            ([0.0, 0.0, 0.2], "its position changes though nobody moved it"),
-            ([3.1, 3.1, 3.1], "beyond its own limits of -170 to 170"),
-        ],
+        ("speed", "reason"),
+        [(0.5, "its position changes though nobody moved it"), (0.0, "limits of -170 to 170")],
+        ids=["tour", "beyond"],
     )
-    def test_must_be_stable_and_within_the_limits(self, opened, monkeypatch, readings, reason):
-        with opened() as (camera, config, _):
-            truly, left = camera.position, iter(readings)
+    def test_must_be_stable_and_within_the_limits(self, opened, monkeypatch, speed, reason):
+        timing = {"settle_timeout_s": 0.6, "poll_interval_s": 0.002}
+        with opened(timing=timing) as (camera, config, simulated):
+            begun = time.monotonic()
 
             def position():
-                pan = next(left, None)
-                return truly() if pan is None else Pose(pan, 0.2, 0.0)
+                return Pose(3.1 + speed * (time.monotonic() - begun), 0.2, 0.0)
 
             monkeypatch.setattr(camera, "position", position)
+            before = simulated.reading()
             report = probe(camera, config, short=True)
             assert reason in report.refused
+            # who did not move it has nothing to put back
+            assert report.moves == 0
+            assert simulated.reading() == before
+
+    def test_a_head_on_its_way_back_is_waited_for(self, opened):
+        head = {"speed_up": 20.0}
+        with opened({"head": head}) as (camera, config, simulated):
+            simulated.move_to(1.5, 0.2, 5.0, 2.0)
+            assert simulated.moving()
+            report = probe(camera, config, short=True)
+            assert report.passed, report.refused
+            assert simulated.reading()[:2] == pytest.approx((1.5, 0.2), abs=0.002)
 
     def test_an_error_of_the_camera_is_its_refusal(self, opened, monkeypatch):
         with opened() as (camera, config, _):

@@ -12,7 +12,7 @@ from torchptz.scanning import head_motion, still_pictures
 from torchptz.scanning.still_pictures import Stills
 
 PERIOD = 0.5  # s, of a buffer
-HERE, THERE = Pose(0.0, 0.1, 0.0), Pose(0.2, 0.1, 0.0)
+HERE, THERE = Pose(0.0, 0.0, 0.0), Pose(0.2, 0.0, 0.0)
 
 
 class Time:

@@ -77,12 +77,12 @@ class TestUnits:
         steps = np.array(curve.units) / 0.04
         assert np.abs(steps - np.rint(steps)).max() < 1e-9
 
-    @pytest.mark.parametrize(("late", "begins"), [(0.004, True), (0.2, False)])
-    def test_a_dead_beginning_is_more_than_a_late_one(self, late, begins):
-        zoom = Zoom(lambda commanded: OPTICAL_UNITS * max(commanded - late, 0) / (1 - late))
-        report = zoom.learn((0.0, 1.0))
-        assert (report.curve.limits[0] == 0) is begins
-        assert bool(report.dead) is not begins
+    @pytest.mark.parametrize(("quantum", "dead"), [(0.0, True), (0.25, False)])
+    def test_a_dead_beginning_is_more_than_one_step(self, quantum, dead):
+        zoom = Zoom(lambda commanded: OPTICAL_UNITS * max(commanded - 0.3, 0) / 0.7)
+        report = zoom.learn((0.0, 1.0), quantum=quantum)
+        assert bool(report.dead) is dead
+        assert (report.curve.limits[0] > 0) is dead
 
 
 class TestCurve:
@@ -153,12 +153,12 @@ class TestRefused:
 class TestDigital:
     BEYOND = 20000  # units, of which the last ones are a crop
 
-    def test_a_crop_is_cut_off_where_the_noise_tells_it(self):
+    def test_a_crop_is_noted_where_the_noise_tells_it_and_measured_like_a_lens(self):
         report = Zoom(quality=None).learn((0, self.BEYOND))
         assert report.digital_told
         assert 0.8 * OPTICAL_UNITS < report.digital_from <= OPTICAL_UNITS
-        assert report.curve.limits[1] == report.digital_from
-        assert "is a crop" in report.notes[-1]
+        assert report.curve.limits[1] == self.BEYOND
+        assert "as a crop does" in " ".join(report.notes)
 
     def test_a_lens_alone_is_told_from_it(self):
         report = Zoom(quality=None).learn()

@@ -269,9 +269,9 @@ def check_signs(name: str, pan_sign: int | None, tilt_sign: int | None) -> None:
             raise ValueError(f"camera {name}: {option} must be 1, -1 or None, not {sign!r}")
 
 
-def check_options(name: str, *options: tuple[str, object, bool]) -> None:
+def check_options(name: str, *options: tuple[str, object, bool, str]) -> None:
     """Raises ValueError, naming the camera, for the first option (name, value, whether it is
-    good) that is not good."""
-    for option, value, good in options:
+    good, what it may be) that is not good."""
+    for option, value, good, allowed in options:
         if not good:
-            raise ValueError(f"camera {name}: {option} cannot be {value!r}")
+            raise ValueError(f"camera {name}: {option} must be {allowed}, not {value!r}")

@@ -159,7 +159,8 @@ class CameraConfig(Section):
                 )
         # The driver knows what its options may be; it sends nothing before it is asked to.
         try:
-            open_camera(self.dialect, self.name, self.address, None, **self.driver_options())
+            options = self.driver_options()
+            open_camera(self.dialect, self.name, self.address, None, **options).close()
         except (TypeError, ValueError) as error:
             text = str(error).removeprefix(f"camera {self.name}: ")
             raise ValueError(f"device: {text}") from None

@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from torchptz.cameras import Camera, CameraError, Pose
-from torchptz.cameras.axes import Axis, HeadAxes
+from torchptz.cameras.axes import HeadAxes
 from torchptz.fleet.config import CameraConfig
 from torchptz.fleet.probe_mechanics import measure_mechanics, watch_motion
+from torchptz.fleet.probe_position import resting_pose, where
 from torchptz.fleet.probe_report import Check, ProbeReport, described
 from torchptz.fleet.putting_back import put_back
 from torchptz.scanning.axis_learning import AxesReport, learn_axes
@@ -26,7 +27,6 @@ _SECOND = 2.0  # magnification that the zoom is checked at
 _ZOOM_OFF = 0.15  # relative
 _STEEPEST = math.radians(45)  # near straight down a pan only turns the picture
 _STAGES = 5
-_STEADY_S = 0.3  # a head whose readings stay the same for so long is at rest
 
 
 def probe(
@@ -76,15 +76,21 @@ class _Probe:
         self._report = ProbeReport(config.name, camera.identity)
         timing = config.timing
         self._look = Stills(
-            camera, stop, timing.settle_timeout_s, timing.poll_interval_s, timing.settle_s
+            camera,
+            stop,
+            timing.settle_timeout_s,
+            timing.poll_interval_s,
+            timing.settle_s,
+            time.monotonic() + timing.longest_s,
         )
 
     def run(self) -> ProbeReport:
-        camera, report = self._camera, self._report
+        camera, config, report = self._camera, self._config, self._report
         began, start, passed = time.monotonic(), None, False
         try:
             self._tell("probing: position", 0, _STAGES)
-            start = self._position()
+            start = resting_pose(camera, self._look.head, config.timing)
+            report.checks.append(Check("position", True, where(start)))
             if not self._short:
                 camera.prepare()
             self._check(start)
@@ -130,35 +136,6 @@ class _Probe:
         self._configured_zooms()
 
     # ---- parts
-
-    def _position(self) -> Pose:
-        """Where the head rests, once it does: an earlier run's may be on its way back."""
-        camera, timing = self._camera, self._config.timing
-        now = anchor = camera.position()
-        began = since = time.monotonic()
-        while time.monotonic() - since < _STEADY_S:
-            if time.monotonic() - began > timing.settle_timeout_s:
-                raise CameraError(
-                    f"{self._name}: its position changes though nobody moved it (now "
-                    f"{_where(now)}); stop its tour or tracking, and keep other users away"
-                )
-            self._look.head.check_stop()
-            time.sleep(min(timing.poll_interval_s, _STEADY_S / 2))
-            now = camera.position()
-            if not self._look.head.same(now, anchor):
-                anchor, since = now, time.monotonic()
-        for what, angle, axis in (
-            ("pan", math.remainder(now.pan, 2 * math.pi), camera.axes.pan),
-            ("tilt", now.tilt, camera.axes.tilt),
-        ):
-            if not _within(angle, axis):
-                low, high = (math.degrees(end) for end in axis.angles)
-                raise CameraError(
-                    f"{self._name}: it reads {what} {math.degrees(angle):.2f} deg, beyond its own "
-                    f"limits of {low:g} to {high:g}; check the ranges in the configuration (device)"
-                )
-        self._report.checks.append(Check("position", True, _where(now)))
-        return now
 
     def _detail(self) -> tuple[float, float] | None:
         """Zoom units and magnification for learning scales."""
@@ -305,16 +282,6 @@ def _same_place(pose: Pose, old: HeadAxes, new: HeadAxes) -> Pose:
     """A pose of the old axes in new ones."""
     pan = new.pan.angle(old.pan.units(pose.pan))
     return replace(pose, pan=pan, tilt=new.tilt.angle(old.tilt.units(pose.tilt)))
-
-
-def _where(pose: Pose) -> str:
-    return f"pan {math.degrees(pose.pan):.2f}, tilt {math.degrees(pose.tilt):.2f} deg"
-
-
-def _within(angle: float, axis: Axis) -> bool:
-    low, high = axis.angles
-    slack = max(axis.step, 1e-3 * (high - low))
-    return axis.circular or low - slack <= angle <= high + slack
 
 
 def _digital(learnt: ZoomReport) -> str:

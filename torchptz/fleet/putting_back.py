@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 from dataclasses import replace
 
 from torchptz.cameras import Camera, Pose
 from torchptz.fleet.config_sections import TimingConfig
+from torchptz.fleet.probe_position import where
 from torchptz.scanning.head_motion import HeadMotion
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ def put_back(
     # In this order: a move after restore() would end the digital zoom that it put back.
     steps = []
     if start is not None:
-        steps.append((f"its head was at {_told(start)}", send))
+        steps.append((f"its head was at {where(start)}, zoom {start.zoom:g} units", send))
     if restore:
         steps.append(("its settings are not all as they were", camera.restore))
     if close:
@@ -61,8 +61,3 @@ def put_back(
             logger.warning("camera %s: while putting it back: %s", camera.name, error)
             left.append(what)
     return left
-
-
-def _told(pose: Pose) -> str:
-    pan, tilt = math.degrees(pose.pan), math.degrees(pose.tilt)
-    return f"pan {pan:.2f}, tilt {tilt:.2f} deg, zoom {pose.zoom:g} units"

@@ -160,7 +160,9 @@ def _start(
     if free[1] and free[2]:
         slope, start = np.polyfit(tilts, true, 1)
     elif free[1]:
-        slope, start = float(np.median((true - zero) / tilts)), zero
+        # By least squares: a tilt of 0 tells nothing of it.
+        away = np.asarray(tilts)
+        slope, start = float(away @ (true - zero) / max(away @ away, 1e-9)), zero
     else:
         slope, start = 1.0, float(np.median(true - tilts)) if free[2] else zero
     if not slope > 0:

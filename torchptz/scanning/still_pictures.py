@@ -86,6 +86,11 @@ class FreshPictures:
             "moving?"
         )
 
+    def begin(self) -> None:
+        """Note what is seen before the first move; later ones leave what was looked at."""
+        if self._left is None:
+            self._left = self._camera.snapshot(), self._camera.position()
+
     def leave(self, frame: np.ndarray, reading: Pose) -> None:
         """Note what is seen, and where, before the head moves on."""
         self._left = frame, reading
@@ -101,8 +106,12 @@ class FreshPictures:
             return False
         (frame, before), can = self._left, self._camera.capabilities
         width = frame.shape[1]
-        magnified = self._camera.magnification(now.zoom)
-        ratio = magnified / self._camera.magnification(before.zoom)
+        # Where a camera was found it may have been at a digital zoom.
+        low, high = can.zoom_limits
+        magnified, magnified_before = (
+            self._camera.magnification(min(max(pose.zoom, low), high)) for pose in (now, before)
+        )
+        ratio = magnified / magnified_before
         if abs(math.log(ratio)) > _TELLING_PX / (width / 4):
             return True
         focal = width / 2 / math.tan((can.horizontal_fov or USUAL_FOV) / 2)
@@ -120,6 +129,7 @@ class Stills:
         settle_timeout_s: longest wait for a head to arrive, and for its pictures.
         poll_interval_s: between two readings, and two pictures.
         settle_s: between two pictures that must agree.
+        deadline: s on the monotonic clock, see `HeadMotion`.
     """
 
     def __init__(
@@ -129,9 +139,10 @@ class Stills:
         settle_timeout_s: float,
         poll_interval_s: float,
         settle_s: float = SETTLE_S,
+        deadline: float = math.inf,
     ) -> None:
         self.camera = camera
-        self.head = HeadMotion(camera, stop, settle_timeout_s, poll_interval_s)
+        self.head = HeadMotion(camera, stop, settle_timeout_s, poll_interval_s, deadline=deadline)
         self.refocuses = False  # at every zoom; else once, where it begins
         self.moves = 0
         self.settling_s = 0.0  # the longest, from stable readings to still pictures
@@ -147,6 +158,7 @@ class Stills:
             Stopped: the run was asked to stop.
         """
         can = self.camera.capabilities
+        self._fresh.begin()
         reading = self.head.go(Pose(*can.nearest_reachable(pose.pan, pose.tilt), pose.zoom))
         if self.refocuses or not self.moves:
             self._focus.at(pose.zoom)

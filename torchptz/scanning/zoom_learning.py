@@ -72,8 +72,8 @@ def learn_zoom(
 
     Returns:
         ZoomReport. The curve is of units as they are commanded: readings may lie beside them. It
-        ends where nothing more is magnified or a digital part begins, and is
-        a guess from where pictures show too little or do not come to rest; its notes say so.
+        ends where nothing more is magnified, and is a guess from where pictures show too little or
+        do not come to rest; its notes say so.
 
     Raises:
         MotionError: the camera does not zoom, or the wrong way, or no picture of it comes to rest;
@@ -140,23 +140,19 @@ def learn_zoom(
     notes += [f"nothing is magnified between {a:g} and {b:g} units of zoom" for a, b in dead]
     digital, told = digital_part([step.detail for step in steps])
     if digital is not None:
+        # No more than a note: a lens out of focus loses detail, too, and a crop is measured as any
+        # other zoom is.
         notes.append(
-            f"beyond {steps[digital - 1].units:g} units of zoom the picture is a crop: that "
-            "digital part is not used"
-        )
-    kept = steps[:digital]
-    if len(kept) < 2:
-        raise MotionError(
-            f"camera {name}: all of its zoom is digital; there is no lens to be measured at "
-            "different zooms: ask for zoom 1 alone"
+            f"beyond {steps[digital - 1].units:g} units of zoom the pictures lose detail as a crop "
+            "does: it may be a digital zoom, or out of focus; ask for no zoom beyond it"
         )
     curve = ZoomCurve(
-        tuple(step.units for step in kept), (1.0, *(math.exp(step.log) for step in kept[1:]))
+        tuple(step.units for step in steps), (1.0, *(math.exp(step.log) for step in steps[1:]))
     )
-    if reached < high and digital is None:
+    if reached < high:
         curve = _continued(curve, guess, max_magnification)
-    sigma = math.hypot(math.sqrt(variance), _BENT * (len(kept) - 1))
-    if max_magnification and reached >= high and digital is None:
+    sigma = math.hypot(math.sqrt(variance), _BENT * (len(steps) - 1))
+    if max_magnification and reached >= high:
         total = curve.max_magnification
         off = abs(math.log(total / max_magnification))
         if off < 3 * sigma:
@@ -172,7 +168,7 @@ def learn_zoom(
         curve,
         sigma,
         tuple(dead),
-        None if digital is None else kept[-1].units,
+        None if digital is None else steps[digital - 1].units,
         told,
         tuple(notes),
     )

@@ -160,7 +160,8 @@ class SimulatedCamera:
     def true_pose(self, pan: float, tilt: float, zoom_units: float) -> HeadPose:
         """The true pose behind settled readings (rad), without jitter and play: adds tilt zero."""
         turns = 1 + self.faults.units_off_percent / 100
-        pan *= -turns if self.faults.pan_reversed else turns
+        pan_turns = 1.0 if self.config.head.pan_circular else turns
+        pan *= -pan_turns if self.faults.pan_reversed else pan_turns
         tilt *= -turns if self.faults.tilt_reversed else turns
         return HeadPose(pan, tilt + radians(self.config.head.tilt_zero_deg), float(zoom_units))
 

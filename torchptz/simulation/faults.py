@@ -52,8 +52,8 @@ class FaultConfig(Section):
     no_position: bool = False  # has no position to tell
     frozen_position: bool = False  # tells the position of when this was switched on
     pan_reading_0_360: bool = False  # counts pan to the right from 0 to 360 degrees
-    units_off_percent: Annotated[float, Field(gt=-50, lt=50)] = 0.0  # it turns so much further
-    # than it is told and than it reads
+    # It turns so much further than it is told and than it reads, but for an endless pan
+    units_off_percent: Annotated[float, Field(gt=-50, lt=50)] = 0.0
     zoom_reading_offset_units: float = 0.0  # reads so many units of its own more
 
     # the head

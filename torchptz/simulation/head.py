@@ -144,7 +144,10 @@ class Head:
             now = now if at is None else min(at, now)
             drift = radians(faults.drift_deg_per_minute) * (now - self._drifts_from) / 60
             turns = 1 + faults.units_off_percent / 100
-            pan = self._true(self._pan, now) * (-turns if faults.pan_reversed else turns) + drift
+            # An endless axis closes after a turn: its units are right whatever they are called.
+            pan_turns = 1.0 if self.config.pan_circular else turns
+            pan = self._true(self._pan, now)
+            pan = pan * (-pan_turns if faults.pan_reversed else pan_turns) + drift
             tilt = self._true(self._tilt, now) * (-turns if faults.tilt_reversed else turns) + drift
             tilt += radians(self.config.tilt_zero_deg)
             if faults.auto_flip and tilt > FLIP_TILT:

@@ -66,13 +66,14 @@ class AxisCamera(Driver):
         read_timeout_s: float = 10.0,
     ) -> None:
         sized = resolution is None or vapix.sizes(resolution) == [resolution]
+        fov = horizontal_fov_deg
         check_options(
             name,
-            ("camera", camera, isinstance(camera, int) and camera >= 1),
-            ("resolution", resolution, sized),
-            ("pause_return", pause_return, isinstance(pause_return, bool)),
-            ("max_magnification", max_magnification, (max_magnification or 2) > 1),
-            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
+            ("camera", camera, isinstance(camera, int) and camera >= 1, "1 or more"),
+            ("resolution", resolution, sized, "like 1920x1080"),
+            ("pause_return", pause_return, isinstance(pause_return, bool), "true or false"),
+            ("max_magnification", max_magnification, (max_magnification or 2) > 1, "more than 1"),
+            ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
         transport = CameraTransport(
             name,

@@ -66,12 +66,13 @@ class HikvisionCamera(Driver):
         horizontal_fov_deg: float | None = None,
         focus_wait_s: float = 3.0,
     ) -> None:
+        fov = horizontal_fov_deg
         check_options(
             name,
-            ("channel", channel, isinstance(channel, int) and channel >= 1),
-            ("precise", precise, isinstance(precise, bool)),
-            ("max_magnification", max_magnification, (max_magnification or 2) > 1),
-            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
+            ("channel", channel, isinstance(channel, int) and channel >= 1, "1 or more"),
+            ("precise", precise, isinstance(precise, bool), "true or false"),
+            ("max_magnification", max_magnification, (max_magnification or 2) > 1, "more than 1"),
+            ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
         transport = CameraTransport(
             name,
@@ -85,8 +86,8 @@ class HikvisionCamera(Driver):
         self._isapi = Isapi(transport)
         self._precise = precise
         self._optical = max_magnification
-        if horizontal_fov_deg is not None:
-            self.horizontal_fov = math.radians(horizontal_fov_deg)
+        if fov is not None:
+            self.horizontal_fov = math.radians(fov)
         self._focus_wait_s = focus_wait_s
         self._ptz = f"/PTZCtrl/channels/{channel}"
         self._focus = f"/Image/channels/{channel}/focusConfiguration"

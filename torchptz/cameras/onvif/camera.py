@@ -85,14 +85,15 @@ class OnvifCamera(Driver):
         read_timeout_s: float = 10.0,
     ) -> None:
         ranges = (pan_range_deg, tilt_range_deg)
+        fov = horizontal_fov_deg
         check_options(
             name,
-            ("path", path, path.startswith("/")),
-            ("snapshot_path", snapshot_path, (snapshot_path or "/").startswith("/")),
-            ("pan_range_deg", ranges[0], _is_range(ranges[0])),
-            ("tilt_range_deg", ranges[1], _is_range(ranges[1])),
-            ("max_magnification", max_magnification, max_magnification > 1),
-            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
+            ("path", path, path.startswith("/"), "like /path"),
+            ("snapshot_path", snapshot_path, (snapshot_path or "/").startswith("/"), "like /path"),
+            ("pan_range_deg", ranges[0], _is_range(ranges[0]), "[low, high]"),
+            ("tilt_range_deg", ranges[1], _is_range(ranges[1]), "[low, high]"),
+            ("max_magnification", max_magnification, max_magnification > 1, "more than 1"),
+            ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
         transport = CameraTransport(
             name,
@@ -111,8 +112,8 @@ class OnvifCamera(Driver):
         self._picture_path = snapshot_path
         self._pictures = self._transport
         self._max_magnification, self._focus_wait_s = max_magnification, focus_wait_s
-        if horizontal_fov_deg is not None:
-            self.horizontal_fov = math.radians(horizontal_fov_deg)
+        if fov is not None:
+            self.horizontal_fov = math.radians(fov)
         self._decimals, self._zoom_decimals = Decimals(), Decimals()
         self._grids = CoarseGrid(), CoarseGrid()  # of pan and tilt
         self._profile = ""  # token, escaped

@@ -74,15 +74,16 @@ class _NamedCamera(Driver):
         scale_sigma = usual.scale_sigma if scale_sigma is None else scale_sigma
         pans = tuple(pan_range_deg or usual.pan_range_deg)
         tilts = tuple(tilt_range_deg or usual.tilt_range_deg)
+        fov = horizontal_fov_deg
         check_options(
             name,
-            ("degrees_per_unit", degrees_per_unit, degrees_per_unit > 0),
-            ("scale_sigma", scale_sigma, scale_sigma >= 0),
-            ("pan_range_deg", pans, pans[0] < pans[1]),
-            ("tilt_range_deg", tilts, tilts[0] < tilts[1]),
-            ("max_magnification", max_magnification, (max_magnification or 2) > 1),
-            ("horizontal_fov_deg", horizontal_fov_deg, 0 < (horizontal_fov_deg or 1) < 180),
-            ("speed", speed, isinstance(speed, int) and 1 <= speed <= _MAX_SPEED),
+            ("degrees_per_unit", degrees_per_unit, degrees_per_unit > 0, "more than 0"),
+            ("scale_sigma", scale_sigma, scale_sigma >= 0, "0 or more"),
+            ("pan_range_deg", pans, pans[0] < pans[1], "[low, high]"),
+            ("tilt_range_deg", tilts, tilts[0] < tilts[1], "[low, high]"),
+            ("max_magnification", max_magnification, (max_magnification or 2) > 1, "more than 1"),
+            ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
+            ("speed", speed, isinstance(speed, int) and 1 <= speed <= _MAX_SPEED, "1..24"),
         )
         transport = CameraTransport(
             name,
@@ -97,8 +98,8 @@ class _NamedCamera(Driver):
         self._scale, self._scale_sigma = math.radians(degrees_per_unit), scale_sigma
         self._magnification = max_magnification or usual.max_magnification
         self._magnification_known = max_magnification is not None
-        if horizontal_fov_deg is not None:
-            self.horizontal_fov = math.radians(horizontal_fov_deg)
+        if fov is not None:
+            self.horizontal_fov = math.radians(fov)
         self._speed, self._focus_wait_s = speed, focus_wait_s
         self._settings = SonySettings(transport)
         self._pictures = SonyPictures(transport)

@@ -72,8 +72,13 @@ class SonyRZ30Camera(Driver):
     ) -> None:
         check_options(
             name,
-            ("pan_speed", pan_speed, isinstance(pan_speed, int) and 1 <= pan_speed <= 24),
-            ("tilt_speed", tilt_speed, isinstance(tilt_speed, int) and 1 <= tilt_speed <= 20),
+            ("pan_speed", pan_speed, isinstance(pan_speed, int) and 1 <= pan_speed <= 24, "1..24"),
+            (
+                "tilt_speed",
+                tilt_speed,
+                isinstance(tilt_speed, int) and 1 <= tilt_speed <= 20,
+                "1..20",
+            ),
         )
         transport = CameraTransport(
             name,
