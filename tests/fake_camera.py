@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchptz.cameras import Capabilities, Pose
+from torchptz.cameras import Capabilities, Pose, ZoomCurve
 from torchptz.geometry import project, to_camera
 from torchptz.lens import RadialLens
 from torchptz.scanning.observation import Observation
@@ -50,7 +50,8 @@ class FakeCamera:
     identity: str = "in memory"
     notes: list[str] = field(default_factory=list)
     axes: None = None  # nobody asks for them but the probe
-    zoom_curve: None = None
+    zoom_curve: ZoomCurve = field(default_factory=lambda: ZoomCurve((0.0, 1000.0), (1.0, 10.0)))
+    zoom_range: tuple[float, float] = (0.0, 1000.0)
 
     def connect(self) -> None:
         """There is nobody to ask."""
