@@ -249,7 +249,11 @@ class SimulatedCamera:
         if self.faults.stale_frames:
             pose = self.head.true_pose()
             with self._lock:
-                self._pose_before, self._stale = pose, self.faults.stale_frames
+                # A device's one order to pan, tilt and zoom is two commands here: by the second one
+                # the head is on its way.
+                if self._pose_before is None or not self.head.moving():
+                    self._pose_before = pose
+                self._stale = self.faults.stale_frames
 
     def _draw_background(self, view: View, pose: HeadPose) -> np.ndarray:
         plain = self.config.scene.plain_background
