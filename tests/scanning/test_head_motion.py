@@ -113,10 +113,19 @@ class TestWay:
         assert head.way_to(pose) is None
         head.camera.pose = replace(pose, pan=0.5 + moved)
         via = head.way_to(pose)
-        assert via == (None if moved < 0 else Pose(0.5 - OVERSHOOT, 0.2, 0.0))
+        # a long way up takes up the play of pan, whatever it was; of tilt nobody knows anything
+        assert via == Pose(0.5 if moved < 0 else 0.5 - OVERSHOOT, 0.2 - OVERSHOOT, 0.0)
         # where somebody else left it, nobody knows how it came there
         head.camera.pose = elsewhere = replace(pose, tilt=0.19)
         assert head.way_to(elsewhere).tilt == pytest.approx(0.19 - OVERSHOOT)
+
+    def test_one_step_of_the_head_down_is_a_move(self, clock):
+        """As small as a flicker of its reading: the play takes it up all the same."""
+        head = motion(Head(capabilities()))
+        at = arrive(head, Pose(0.5, 0.2, 0.0))
+        quantum = head.camera.capabilities.tilt_quantum
+        assert head.way_to(replace(at, tilt=at.tilt + quantum)) is None
+        assert head.way_to(replace(at, tilt=at.tilt - quantum)).tilt < at.tilt - 2 * quantum
 
     def test_one_that_came_directly_is_no_arrival_upwards(self, clock):
         head = motion(Head())

@@ -22,6 +22,7 @@ _BESIDE_S = 0.6
 _NOT_OFF_S = 1.0
 # Two readings closer than this are one: at rest a reading may flicker by a count.
 _FLICKER_QUANTA = 1.1
+_SAME_TARGET = 1e-5  # rad; two targets on the grid that differ by less are one
 _ZOOM_ARRIVAL = 0.003  # of the zoom range
 _ZOOM_FLICKER = 0.0005  # of the zoom range
 # A continuous axis has no quantum; its readings are good to about this.
@@ -68,9 +69,10 @@ class HeadMotion:
         self._poll = poll_interval_s
         self._overshoot = overshoot
         self._deadline = deadline
-        self._stood: Pose | None = None  # where it was read last at rest
+        self._sent: Pose | None = None  # where it was sent last, on its grid, and arrived
+        self._stood: Pose | None = None  # what it read there
         self._here: Pose | None = None  # where it was read since, before a command
-        self._upwards = {"pan": False, "tilt": False}  # whether an axis arrived so last
+        self._upwards = dict.fromkeys(_AXES, False)  # whether an axis arrived so last
         self._believes_flag = True
         self._flag_stuck = False
         self._usual_miss = 0.0  # quanta by which the head stops beside its targets
@@ -89,34 +91,45 @@ class HeadMotion:
         """A pose to go to first, so that both axes arrive upwards; None: the way there is right."""
         if not self._overshoot:
             return None
-        can = self.camera.capabilities
-        here = self._here = self.camera.position()
-        # As the device rounds them: a pose that differs by less turns no axis.
-        target = dict(zip(_AXES, can.nearest_reachable(pose.pan, pose.tilt), strict=True))
-        moved = self._moves(here, Pose(*target.values(), pose.zoom))
-        via = {}
-        for axis, angle in target.items():
-            standing = self._arrived_upwards(here, axis)
-            right = self._ends_upwards(axis, moved[axis], standing)
-            via[axis] = angle if right else angle - self._step_back(axis, angle)
-        return None if via == target else Pose(*via.values(), pose.zoom)
+        self._here = self.camera.position()
+        target = self._on_grid(pose)
+        via = {
+            axis: angle if right else angle - self._step_back(axis, angle)
+            for (axis, angle), right in zip(
+                (("pan", target.pan), ("tilt", target.tilt)),
+                self._ends_upwards(target).values(),
+                strict=True,
+            )
+        }
+        straight = via == {"pan": target.pan, "tilt": target.tilt}
+        return None if straight else Pose(*via.values(), pose.zoom)
 
-    def _arrived_upwards(self, here: Pose, axis: str) -> bool:
-        """Whether an axis stands where it arrived upwards; not if somebody moved it since."""
-        if self._stood is None:
-            return False
-        return self._upwards[axis] and abs(self._moves(self._stood, here)[axis]) <= self._flicker(
-            axis
-        )
+    def _on_grid(self, pose: Pose) -> Pose:
+        reachable = self.camera.capabilities.nearest_reachable(pose.pan, pose.tilt)
+        return Pose(*reachable, pose.zoom)
 
-    def _ends_upwards(self, axis: str, moved: float, standing: bool) -> bool:
-        """Whether a move of so many rad ends with the play on the upward side.
+    def _ends_upwards(self, target: Pose) -> dict[str, bool]:
+        """Whether a move to a target ends with the play of each axis on the upward side.
 
-        standing: whether it was there before; else a move must be long enough to take it up.
+        Counted from where the head was sent last, as a reading may flicker by a count; unless it
+        is not there any more: then nobody knows on which side its play lies, and a move must be
+        long enough to take it up.
         """
-        if abs(moved) <= self._flicker(axis):
-            return standing
-        return moved > 0 and (standing or moved >= self._overshoot)
+        here, sent = self._here, self._sent
+        left_alone = here is None or (self._stood is not None and self.same(here, self._stood))
+        origin = sent if left_alone else here
+        if origin is None:
+            return dict.fromkeys(_AXES, False)
+        moved = {"pan": target.pan - origin.pan, "tilt": target.tilt - origin.tilt}
+        if self.camera.capabilities.pan_circular:
+            moved["pan"] = math.remainder(moved["pan"], 2 * math.pi)
+        found = {}
+        for axis, angle in moved.items():
+            standing = left_alone and self._upwards[axis]
+            stays = abs(angle) <= _SAME_TARGET
+            upwards = angle > 0 and (standing or angle >= self._overshoot)
+            found[axis] = standing if stays else upwards
+        return found
 
     def _step_back(self, axis: str, angle: float) -> float:
         """rad, the overshoot in whole steps, within the device's own limits."""
@@ -130,18 +143,6 @@ class HeadMotion:
             back = min(back, max(angle - low, 0.0))
         quantum = getattr(can, f"{axis}_quantum")
         return math.floor(back / quantum + 1e-6) * quantum if quantum else back
-
-    def _moves(self, before: Pose, after: Pose) -> dict[str, float]:
-        """rad, by axis; of pans the short way round, which an endless axis goes."""
-        pan = after.pan - before.pan
-        if self.camera.capabilities.pan_circular:
-            pan = math.remainder(pan, 2 * math.pi)
-        return {"pan": pan, "tilt": after.tilt - before.tilt}
-
-    def _flicker(self, axis: str) -> float:
-        """rad, by which two readings of one place may differ."""
-        quantum = getattr(self.camera.capabilities, f"{axis}_quantum")
-        return _FLICKER_QUANTA * max(quantum, _FINEST)
 
     def go(self, pose: Pose) -> Pose:
         """Send the head to a pose and wait until its readings are stable there.
@@ -157,8 +158,9 @@ class HeadMotion:
         sends = 1
         # Time counts from here: a camera that is slow to reply has not begun to move before.
         started = changed = time.monotonic()
-        began = first = self._here or self._stood  # where it was read before the command
-        self._here = None
+        first = self._here or self._stood  # where it was read before the command
+        target = self._on_grid(pose)
+        upwards = self._ends_upwards(target)
         anchor = None  # the reading that later ones are the same as
         while True:
             self.check_stop()
@@ -171,7 +173,8 @@ class HeadMotion:
             elif self._arrived(reading, pose, now - changed, self.same(reading, first)):
                 if not self._waits_for_flag(now - changed):
                     self._learn_miss(reading, pose)
-                    self._stand(began, reading)
+                    self._sent, self._stood, self._upwards = target, reading, upwards
+                    self._here = None
                     return reading
                 time.sleep(self._poll)
                 continue
@@ -205,16 +208,6 @@ class HeadMotion:
         where = "at the target" if quanta <= _THERE_QUANTA else f"{quanta:.1f} quanta beside it"
         flag = "; the device says that it still moves" if self._flag_stuck else ""
         return f"readings agree to a quantum, {where}; pictures agree{flag}"
-
-    def _stand(self, began: Pose | None, reading: Pose) -> None:
-        """Note where the head has arrived, and from which side."""
-        moved = None if began is None else self._moves(began, reading)
-        for axis in _AXES:
-            standing = began is not None and self._arrived_upwards(began, axis)
-            self._upwards[axis] = moved is not None and self._ends_upwards(
-                axis, moved[axis], standing
-            )
-        self._stood = reading
 
     def _waits_for_flag(self, unchanged_s: float) -> bool:
         """Whether to wait for a device that says it moves though its readings stand still."""
