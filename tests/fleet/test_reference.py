@@ -50,15 +50,15 @@ class TestVisits:
         assert record.untrue is None
 
     def test_rounding_is_no_fault_and_more_is(self):
-        reference, record = setup(moved=lambda number: 2.4 * QUANTUM[0] * (number > 0))
+        reference, record = setup(moved=lambda number: 1.1 * QUANTUM[0] * (number > 0))
         reference.visit()
         reference.visit()
         assert record.reference[1].shift_px[0] == pytest.approx(
-            2.4 * QUANTUM[0] * FOCAL * math.cos(0.2), rel=0.02
+            1.1 * QUANTUM[0] * FOCAL * math.cos(0.2), rel=0.02
         )
-        reference, record = setup(moved=lambda number: 2.8 * QUANTUM[0] * (number > 0))
+        reference, record = setup(moved=lambda number: 1.5 * QUANTUM[0] * (number > 0))
         reference.visit()
-        with pytest.raises(MotionError, match=r"camera fake: .*0\.19 degrees.*lost its place"):
+        with pytest.raises(MotionError, match=r"camera fake: .*0\.1 degrees.*lost its place"):
             reference.visit()
         assert "not to be trusted" in record.untrue
 

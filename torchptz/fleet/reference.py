@@ -13,9 +13,9 @@ from torchptz.scanning.approach import Approach
 from torchptz.scanning.observation import Observation, Observer
 
 # What two visits may differ by without anything being wrong: so many quanta, as heads stop up to
-# one beside their readings and a reading may flicker; so many sigmas of what the head repeats to;
-# and px.
-_QUANTA, _SIGMAS, _PIXELS = 2.5, 4 * math.sqrt(2), 1.5
+# half a one beside their readings; so many sigmas of what a worse head is said to repeat to; and
+# px. More would let a drift pass that is several sigmas of the lens.
+_QUANTA, _SIGMAS, _PIXELS = 1.2, 4 * math.sqrt(2), 1.5
 _ATTEMPTS = 2  # to see the feature
 _FEWEST_VISITS = 4  # that tell how well a head repeats
 
