@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from torchptz.cameras import Axis, ConnectionFailed, HeadAxes, MotionError, Pose, ZoomCurve
-from torchptz.cameras.base import CameraError
+from torchptz.cameras.base import CameraError, ProtocolError
 from torchptz.cameras.driver import Driver, signed
 from torchptz.cameras.http.transport import CameraTransport
 
@@ -165,3 +165,8 @@ class TestUndoing:
         broken.clear()
         device.restore()
         assert done == ["overlay", "zoom"]
+
+
+def test_a_device_without_a_focus_to_set_says_so(device):
+    with pytest.raises(ProtocolError, match=r"camera gate .*focus 12; set it by hand"):
+        device.set_focus(12.0)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from .axes import Axis, HeadAxes
-from .base import CameraError, Capabilities, MotionError, Pose
+from .base import CameraError, Capabilities, MotionError, Pose, ProtocolError
 from .http.transport import CameraTransport
 from .zoom_curve import ZoomCurve
 
@@ -85,8 +85,10 @@ class Driver(ABC):
         Returns the focus, device units, where it can be read and set."""
 
     def set_focus(self, focus: float) -> None:
-        """Go to a focus that focus_once() returned; of dialects where it returns one."""
-        raise NotImplementedError
+        """Go to a focus that focus_once() returned. Raises ProtocolError for a device that cannot
+        be sent to one, whose focus_once() returns none."""
+        cause = f"cannot be sent to the focus {focus:g}"
+        raise self._transport.error(ProtocolError, cause, "set it by hand")
 
     def at_rest(self) -> bool | None:
         """What the device said of its motion with the last position(); None: nothing."""
