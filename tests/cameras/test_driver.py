@@ -8,7 +8,6 @@ import pytest
 from torchptz.cameras import Axis, ConnectionFailed, HeadAxes, MotionError, Pose, ZoomCurve
 from torchptz.cameras.base import CameraError, ProtocolError
 from torchptz.cameras.driver import Driver, signed
-from torchptz.cameras.http.transport import CameraTransport
 
 DEGREE = math.radians(1)
 AXES = HeadAxes(
@@ -22,7 +21,7 @@ class Device(Driver):
     """A dialect without messages."""
 
     def __init__(self, pan_sign=None, tilt_sign=None):
-        super().__init__("gate", CameraTransport("gate", "host"), (pan_sign, tilt_sign))
+        super().__init__("gate", "host", signs=(pan_sign, tilt_sign))
 
     def connect(self):
         self.axes, self.zoom_curve, self.horizontal_fov = AXES, ZOOM, 1.0

@@ -11,7 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from .axes import Axis, HeadAxes
-from .base import CameraError, Capabilities, MotionError, Pose, ProtocolError
+from .base import (
+    CameraError,
+    Capabilities,
+    Credentials,
+    MotionError,
+    Pose,
+    ProtocolError,
+)
+from .http.tls import Tls
 from .http.transport import CameraTransport
 from .zoom_curve import ZoomCurve
 
@@ -35,11 +43,25 @@ class Driver(ABC):
     def __init__(
         self,
         name: str,
-        transport: CameraTransport,
+        address: str,
+        credentials: Credentials | None = None,
         signs: tuple[int | None, int | None] = (None, None),
+        tls: Tls | None = None,
+        timeouts_s: tuple[float, float] = (3.0, 10.0),
     ) -> None:
-        """signs: of pan and tilt, as configured: see `signed`. Raises ValueError for others."""
+        """signs: of pan and tilt, as configured: see `signed`. timeouts_s: for a connection and
+        for an answer. The rest: see CameraTransport. Raises ValueError for what cannot be.
+        """
         check_signs(name, *signs)
+        connect_s, read_s = timeouts_s
+        self._transport = CameraTransport(
+            name,
+            address,
+            credentials,
+            tls=tls,
+            connect_timeout_s=connect_s,
+            read_timeout_s=read_s,
+        )
         self.name = name
         self.identity = ""  # model, serial, firmware, as the device says; for reports
         self.notes: list[str] = []  # what about the device a user should know, and what to do
@@ -47,7 +69,6 @@ class Driver(ABC):
         self.zoom_curve: ZoomCurve | None = None
         self.horizontal_fov: float | None = None  # rad, at the widest zoom
         self.reported_moving: bool | None = None  # what the last position() said; None: nothing
-        self._transport = transport
         self._signs = signs
         self._whole_zoom: tuple[float, float] | None = None  # device units; None: the curve's
         self._margin = 0.0  # rad

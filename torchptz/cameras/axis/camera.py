@@ -19,7 +19,7 @@ from ..coarse_grid import CoarseGrid
 from ..driver import Driver, check_options, signed
 from ..focus import settled
 from ..http.tls import Tls
-from ..http.transport import CameraTransport, Reply
+from ..http.transport import Reply
 from ..switches import switch
 from ..zoom_curve import ZoomCurve
 from . import description as about
@@ -75,16 +75,9 @@ class AxisCamera(Driver):
             ("max_magnification", max_magnification, (max_magnification or 2) > 1, "more than 1"),
             ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(name, transport, (pan_sign, tilt_sign))
-        self._channel = VapixChannel(transport, camera)
+        timeouts_s = (connect_timeout_s, read_timeout_s)
+        super().__init__(name, address, credentials, (pan_sign, tilt_sign), tls, timeouts_s)
+        self._channel = VapixChannel(self._transport, camera)
         self._camera, self._source = camera, camera - 1  # channels count from 1, sources from 0
         self._resolution, self._listed = resolution, []
         self._pause_return = pause_return

@@ -20,7 +20,7 @@ from ..base import BadPicture, Credentials, Pose, ProtocolError
 from ..driver import Driver, check_options, signed
 from ..http.safe_xml import local, text_of
 from ..http.tls import Tls
-from ..http.transport import CameraTransport, Reply
+from ..http.transport import Reply
 from ..switches import switch
 from ..zoom_curve import ZoomCurve
 from .isapi import Isapi
@@ -74,16 +74,9 @@ class HikvisionCamera(Driver):
             ("max_magnification", max_magnification, (max_magnification or 2) > 1, "more than 1"),
             ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(name, transport, (pan_sign, tilt_sign))
-        self._isapi = Isapi(transport)
+        timeouts_s = (connect_timeout_s, read_timeout_s)
+        super().__init__(name, address, credentials, (pan_sign, tilt_sign), tls, timeouts_s)
+        self._isapi = Isapi(self._transport)
         self._precise = precise
         self._optical = max_magnification
         if fov is not None:

@@ -22,7 +22,7 @@ from ..coarse_grid import CoarseGrid
 from ..driver import Driver, check_options, signed
 from ..http.safe_xml import find, text_of
 from ..http.tls import Tls
-from ..http.transport import CameraTransport, Reply
+from ..http.transport import Reply
 from ..zoom_curve import ZoomCurve
 from .channel import OnvifChannel
 from .imaging import OnvifImaging
@@ -95,15 +95,8 @@ class OnvifCamera(Driver):
             ("max_magnification", max_magnification, max_magnification > 1, "more than 1"),
             ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
         )
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(name, transport, (pan_sign, tilt_sign))
+        timeouts_s = (connect_timeout_s, read_timeout_s)
+        super().__init__(name, address, credentials, (pan_sign, tilt_sign), tls, timeouts_s)
         self._channel = OnvifChannel(self._transport, path, credentials)
         self._services = OnvifServices(self._channel, self._transport)
         self._ranges_deg = ranges

@@ -20,7 +20,6 @@ from ..base import Credentials, Pose, ProtocolError
 from ..driver import Driver, check_options, signed
 from ..focus import settled
 from ..http.tls import Tls
-from ..http.transport import CameraTransport
 from ..switches import switch
 from . import zoom as sony_zoom
 from .ptzf import POSITION, Format, Ptzf
@@ -85,15 +84,8 @@ class _NamedCamera(Driver):
             ("horizontal_fov_deg", fov, 0 < (fov or 1) < 180, "0..180"),
             ("speed", speed, isinstance(speed, int) and 1 <= speed <= _MAX_SPEED, "1..24"),
         )
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(name, transport, (pan_sign, tilt_sign))
+        timeouts_s = (connect_timeout_s, read_timeout_s)
+        super().__init__(name, address, credentials, (pan_sign, tilt_sign), tls, timeouts_s)
         self._ranges_deg = pans, tilts
         self._scale, self._scale_sigma = math.radians(degrees_per_unit), scale_sigma
         self._magnification = max_magnification or usual.max_magnification
@@ -101,8 +93,8 @@ class _NamedCamera(Driver):
         if fov is not None:
             self.horizontal_fov = math.radians(fov)
         self._speed, self._focus_wait_s = speed, focus_wait_s
-        self._settings = SonySettings(transport)
-        self._pictures = SonyPictures(transport)
+        self._settings = SonySettings(self._transport)
+        self._pictures = SonyPictures(self._transport)
         self._asked: str | None = None  # pan, tilt, zoom of the last move, as written
         self._can_focus = True  # until the firmware refuses the switch
 

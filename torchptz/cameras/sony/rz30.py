@@ -14,7 +14,6 @@ from ..base import Credentials, Pose, ProtocolError
 from ..driver import Driver, check_options, signed
 from ..focus import settled
 from ..http.tls import Tls
-from ..http.transport import CameraTransport
 from ..switches import switch
 from . import visca
 from . import zoom as sony_zoom
@@ -80,21 +79,14 @@ class SonyRZ30Camera(Driver):
                 "1..20",
             ),
         )
-        transport = CameraTransport(
-            name,
-            address,
-            credentials,
-            tls=tls,
-            connect_timeout_s=connect_timeout_s,
-            read_timeout_s=read_timeout_s,
-        )
-        super().__init__(name, transport, (pan_sign, tilt_sign))
+        timeouts_s = (connect_timeout_s, read_timeout_s)
+        super().__init__(name, address, credentials, (pan_sign, tilt_sign), tls, timeouts_s)
         self.axes = signed(AXES, *self._signs)
         self.zoom_curve = sony_zoom.curve(MAX_MAGNIFICATION)
         self.horizontal_fov = HORIZONTAL_FOV
-        self._channel = ViscaChannel(transport)
-        self._settings = SonySettings(transport)
-        self._pictures = SonyPictures(transport)
+        self._channel = ViscaChannel(self._transport)
+        self._settings = SonySettings(self._transport)
+        self._pictures = SonyPictures(self._transport)
         self._speeds = f"{pan_speed:02X}{tilt_speed:02X}"
         self._focus_wait_s = focus_wait_s
 
